@@ -1,0 +1,61 @@
+# `make` alone lists what there is. Everything runs in .venv, which `make install` creates.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.lagros-installed
+SPEED_STAMP := $(VENV)/.lagros-speed-installed
+
+# Two test workers, each with one thread: more threads than cores make small matrix products slow.
+# No test opens a window.
+PYTEST := OMP_NUM_THREADS=1 MPLBACKEND=Agg SDL_VIDEODRIVER=dummy $(BIN)/python -m pytest -n 2
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help install demo test test-slow lint format speed clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+install: $(STAMP) ## create .venv and install lagros with all extras, in the pinned versions
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+		|| { echo "lagros needs Python 3.11 or later; name one with: make install PYTHON=..." >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+# The interpreter is an order-only prerequisite: its date says nothing about what is installed.
+# torch goes first, so that its build is settled before the packages that depend on it.
+$(STAMP): pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install -c constraints.txt torch
+	$(BIN)/python -m pip install -c constraints.txt -e ".[all]"
+	@touch $@
+
+$(SPEED_STAMP): $(STAMP)
+	$(BIN)/python -m pip install -c constraints.txt -e ".[speed]"
+	@touch $@
+
+demo: install ## a short tour: one command, no settings
+	$(BIN)/lagros demo
+
+test: lint ## lint, then the tests that are not marked slow
+	$(PYTEST) -m "not slow"
+
+test-slow: install ## the tests that are marked slow
+	$(PYTEST) -m slow
+
+lint: install ## ruff and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: install ## rewrite the code in the project's format
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+speed: $(SPEED_STAMP) ## micro-benchmarks against peers
+	$(BIN)/python benchmarks/speed/run.py
+
+clean: ## remove caches and build products; .venv and runs/ stay
+	rm -rf build dist site .mypy_cache .pytest_cache .ruff_cache .hypothesis *.egg-info
+	find . -path ./$(VENV) -prune -o -type d -name __pycache__ -exec rm -rf {} +

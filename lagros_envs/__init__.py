@@ -1,0 +1,14 @@
+"""Environments with bounded disturbance; importing this package registers their ids.
+
+`gym.make("lagros/CartPole-v0")` and `gym.make_vec("lagros/CartPole-v0", num_envs=1024)`.
+"""
+
+from gymnasium.envs.registration import register
+
+__version__ = "0.1.0"
+
+register(
+    id="lagros/CartPole-v0",
+    entry_point="lagros_envs.cartpole:CartPoleEnv",
+    vector_entry_point="lagros_envs.cartpole_vector:CartPoleVectorEnv",
+)

@@ -1,0 +1,288 @@
+"""`lagros/CartPole-v0`: bring a cart with a falling pole to a place, under bounded disturbance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from lagros_envs import cartpole_task as task
+from lagros_envs.disturbances import Disturbance, Situation, channel_mask
+from lagros_envs.dynamics.integrate import rk4_hold
+from lagros_envs.seeding import episode_streams
+
+FloatArray = NDArray[np.float64]
+
+
+class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """Cart-pole with a continuous force, held for 0.1 s, and a bounded disturbance of the state.
+
+    ## Action
+    One number, `Box(-1, 1, (1,))`: the force on the cart in units of `settings.force_scale`
+    (40 N). Actions beyond +-1 are applied as they are, unless `settings.force_limit` is set.
+
+    ## Observation
+    A flat float32 vector of 13; `gymnasium.spaces.unflatten(env.unwrapped.named_space, obs)` names
+    its parts:
+
+    | index | part            | content                                            |
+    |-------|-----------------|----------------------------------------------------|
+    | 0-3   | `state`         | x = [p, theta, dp/dt, dtheta/dt] [m, rad, m/s, rad/s] |
+    | 4-7   | `goal`          | x_f = [p_f, 0, 0, 0]                               |
+    | 8-11  | `initial_state` | x(0)                                               |
+    | 12    | `time`          | t [s]                                              |
+
+    ## Dynamics
+    dx/dt = f(x) + B(x) u + d, Runge-Kutta in two substeps, u and d held over the control step,
+    ||d|| <= `disturbance_bound`.
+
+    ## Reward
+    `lagros_envs.cartpole_task.reward`: minus effort and distance to the goal, plus a bonus for
+    every step upright and one for the first success.
+
+    ## Starting state
+    theta_0 uniform in +-60 degrees at rest, goal p_f uniform in +-5 m. `reset(options=...)` takes
+    `initial_state`, `goal` and `nominal` (x_d at every control instant, shape (91, 4)).
+
+    ## Episode end
+    `terminated` when |theta| > pi/2 (a fall); `truncated` at 9 s. The episode goes on after
+    success: the paper counts the first entry, the strict measure looks at the end.
+
+    ## Info
+    `success` (the paper's: at some control instant so far ||x - x_f|| <= r(t)), `success_time` [s]
+    (inf before), `inside_tube` (the same at this instant), `fallen`, `effort` (the integral of
+    ||u||^2 so far), `effort_to_success` (the same, frozen at the first success), `disturbance` (d
+    of the step), `tube_radius` r(t), `goal_distance` and, where the episode has a nominal,
+    `tracking_error` ||x - x_d||.
+
+    Args:
+        disturbance: Kind of disturbance, one of `lagros_envs.disturbances.KINDS`, or a function of
+            a `Situation`.
+        disturbance_bound: d_bar, in units of the state per second.
+        disturbance_channels: "all", "rates", or a mask of the four states.
+        metric: Contraction metric M for the kind "worst": (4, 4), or a function of the state.
+        settings: The task.
+        render_mode: None, "human" or "rgb_array".
+
+    Raises:
+        ValueError: A setting is not valid.
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
+
+    def __init__(
+        self,
+        disturbance: str | Any = "none",
+        disturbance_bound: float = 0.75,
+        disturbance_channels: Literal["all", "rates"] | Sequence[bool] = "all",
+        metric: Any = None,
+        settings: task.CartPoleSettings | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """Build the environment; see the class for the arguments."""
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(
+                f"render_mode={render_mode!r} is not known; use one of "
+                f"{self.metadata['render_modes']} or None"
+            )
+        self.settings = settings or task.CartPoleSettings()
+        self.disturbance = Disturbance(
+            disturbance, disturbance_bound, channel_mask(disturbance_channels, task.RATES), metric
+        )
+        self.named_space = task.named_space(self.settings)
+        self.observation_space = cast("spaces.Space[NDArray[np.float32]]", spaces.flatten_space(self.named_space))
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.render_mode = render_mode
+        self._renderer: Any = None
+        self._started = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seed of the episode; the scenario and the disturbance have a stream each.
+            options: `initial_state` (4,), `goal` (4,) or p_f, `nominal` (steps + 1, 4).
+
+        Returns:
+            The observation and the info.
+
+        Raises:
+            ValueError: An option has a wrong shape or value.
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        if seed is None:
+            seed = int(self.np_random.integers(2**63))
+        streams = episode_streams(seed)
+        drawn = task.sample_scenario(streams.scenario, self.settings)
+        self.scenario = task.scenario_from_options(options, drawn)
+        self.nominal = task.nominal_from_options(options, self.settings)
+        self._pushes = self.disturbance.realise(
+            streams.disturbance, self.settings.steps, self.settings.control_period
+        )
+        if self.disturbance.kind == "worst" and self.nominal is None:
+            raise ValueError(
+                'disturbance="worst" needs the nominal trajectory of the episode: pass '
+                'reset(options={"nominal": array of shape (steps + 1, 4)})'
+            )
+        self._state: tuple[float, ...] = tuple(self.scenario.initial_state.tolist())
+        self._goal: tuple[float, ...] = tuple(self.scenario.goal.tolist())
+        self._constant_part = np.concatenate([self.scenario.goal, self.scenario.initial_state])
+        self._step = 0
+        self._effort = 0.0
+        self._effort_to_success = 0.0
+        self._success_time = math.inf
+        self._push = np.zeros(task.STATE_DIM)
+        self._started = True
+        distance = task.goal_distance(self._state, self._goal, math.sqrt)
+        self._note_success(distance, fallen=False)
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), self._info(distance, fallen=False)
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Hold the force for one control step.
+
+        Args:
+            action: Force in units of `settings.force_scale`, shape (1,).
+
+        Returns:
+            Observation, reward, terminated, truncated, info.
+
+        Raises:
+            ValueError: The action is not one finite number.
+            RuntimeError: The environment was not reset.
+        """
+        if not self._started:
+            raise RuntimeError("call reset() before step()")
+        force = self._force(action)
+        settings = self.settings
+        push = self._current_push()
+        self._state = tuple(
+            rk4_hold(
+                settings.system, self._state, (force,), push.tolist(), settings.control_period, math
+            )
+        )
+        self._push = push
+        self._step += 1
+        effort = force * force * settings.control_period
+        self._effort += effort
+        # A state that overflowed has fallen too: `not <=` also catches nan.
+        fallen = not abs(self._state[1]) <= task.FALL_ANGLE
+        distance = task.goal_distance(self._state, self._goal, math.sqrt)
+        first_success = self._note_success(distance, fallen)
+        reward = float(task.reward(settings, effort, distance, first_success, fallen))
+        truncated = self._step >= settings.steps
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), reward, fallen, truncated, self._info(distance, fallen)
+
+    @property
+    def state(self) -> FloatArray:
+        """The state x in double precision, shape (4,)."""
+        return np.array(self._state)
+
+    @property
+    def time(self) -> float:
+        """The time t [s]."""
+        return self._step * self.settings.control_period
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the scene: an RGB array, or a window in the mode "human"."""
+        if self.render_mode is None:
+            gym.logger.warn(
+                "render() was called without a render mode; "
+                'pass render_mode="rgb_array" to gym.make'
+            )
+            return None
+        if self._renderer is None:
+            from lagros_envs.rendering import CartPoleRenderer
+
+            self._renderer = CartPoleRenderer(self.render_mode, self.metadata["render_fps"])
+        nominal = None if self.nominal is None else self.nominal[self._nominal_index()]
+        frame: NDArray[np.uint8] | None = self._renderer.draw(
+            state=self.state,
+            goal=self.scenario.goal,
+            tube_radius=self.settings.tube.radius(self.time),
+            disturbance=self._push,
+            disturbance_bound=self.disturbance.bound,
+            nominal=nominal,
+            time=self.time,
+            half_length=self.settings.system.half_length,
+        )
+        return frame
+
+    def close(self) -> None:
+        """Release the window."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _force(self, action: NDArray[np.float32]) -> float:
+        values = np.asarray(action)
+        if values.shape != (1,):
+            raise ValueError(f"action has shape {values.shape}; it must be one number, shape (1,)")
+        value = float(values[0])
+        if not math.isfinite(value):
+            raise ValueError(f"action={value!r} is not finite")
+        force: float = task.applied_force(self.settings, value, _clip)
+        return force
+
+    def _current_push(self) -> FloatArray:
+        # Past the time limit (a caller who ignored `truncated`) the last push stays.
+        index = min(self._step, self.settings.steps - 1)
+        if not self.disturbance.is_feedback:
+            return cast(FloatArray, self._pushes[index])
+        nominal = None if self.nominal is None else self.nominal[self._nominal_index()]
+        return self.disturbance.respond(
+            Situation(self.state, nominal, np.asarray(self.time), self._pushes[index])
+        )
+
+    def _nominal_index(self) -> int:
+        return min(self._step, self.settings.steps)
+
+    def _note_success(self, distance: float, fallen: bool) -> bool:
+        self._inside = not fallen and distance <= self.settings.tube.radius(self.time)
+        if math.isfinite(self._success_time):
+            return False
+        self._effort_to_success = self._effort
+        if self._inside:
+            self._success_time = self.time
+        return self._inside
+
+    def _observation(self) -> NDArray[np.float32]:
+        observation = np.empty(task.OBSERVATION_DIM, np.float32)
+        observation[task.STATE] = self._state
+        observation[4:12] = self._constant_part
+        observation[task.TIME] = self.time
+        return observation
+
+    def _info(self, distance: float, fallen: bool) -> dict[str, Any]:
+        info = {
+            "success": math.isfinite(self._success_time),
+            "success_time": self._success_time,
+            "inside_tube": self._inside,
+            "fallen": fallen,
+            "effort": self._effort,
+            "effort_to_success": self._effort_to_success,
+            "disturbance": self._push,
+            "tube_radius": self.settings.tube.radius(self.time),
+            "goal_distance": distance,
+        }
+        if self.nominal is not None:
+            nominal = self.nominal[self._nominal_index()].tolist()
+            info["tracking_error"] = task.goal_distance(self._state, nominal, math.sqrt)
+        return info
+
+
+def _clip(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)

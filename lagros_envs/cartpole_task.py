@@ -1,0 +1,236 @@
+"""The cart-pole task of the paper: settings, scenarios, observation, reward and success.
+
+Pure functions, written for floats and for arrays alike, so that the single environment and its
+vectorised twin share every definition.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from lagros_envs.dynamics import CartPole
+from lagros_envs.tube import PaperTube
+
+FloatArray = NDArray[np.float64]
+
+STATE_DIM = 4
+RATES = (False, False, True, True)
+FALL_ANGLE = math.pi / 2  # [rad]
+# Where each named part of the observation lies.
+STATE = slice(0, 4)
+GOAL = slice(4, 8)
+INITIAL_STATE = slice(8, 12)
+TIME = 12
+OBSERVATION_DIM = 13
+
+
+@dataclass(frozen=True)
+class CartPoleSettings:
+    """Everything that defines the task, with the values of the paper as defaults.
+
+    Attributes:
+        system: The cart-pole.
+        control_period: Zero-order hold, the largest admissible control interval [s].
+        time_limit: Episode length, T and its limit alike [s].
+        initial_angle: theta_0 is uniform in plus or minus this [rad].
+        goal_range: p_f is uniform in plus or minus this [m].
+        force_limit: Saturation of the force [N]; None leaves it unlimited.
+        force_scale: Force of the action 1.0 [N]. Actions beyond +-1 are applied as they are unless
+            `force_limit` is set; the bounds tell a learner what range to explore.
+        tube: The published tube; its radius is the success threshold.
+        effort_weight: Reward per N^2 s of effort, negative sign applied.
+        distance_weight: Reward per (unit of distance to the goal) s, negative sign applied.
+        upright_bonus: Reward per second that the pole has not fallen, so that falling early
+            never pays.
+        success_bonus: Reward at the first success.
+
+    Raises:
+        ValueError: A value is out of range or the limit is not a whole number of periods.
+    """
+
+    system: CartPole = field(default_factory=CartPole)
+    control_period: float = 0.1
+    time_limit: float = 9.0
+    initial_angle: float = math.pi / 3
+    goal_range: float = 5.0
+    force_limit: float | None = None
+    force_scale: float = 40.0
+    tube: PaperTube = field(default_factory=PaperTube)
+    effort_weight: float = 0.01
+    distance_weight: float = 1.0
+    upright_bonus: float = 10.0
+    success_bonus: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, float) and not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{item.name}={value!r} must be finite and >= 0")
+        for name in ("control_period", "time_limit", "force_scale"):
+            if getattr(self, name) == 0.0:
+                raise ValueError(f"{name}=0.0 must be > 0")
+        if self.force_limit == 0.0:
+            raise ValueError("force_limit=0.0 must be > 0, or None for no limit")
+        if self.initial_angle >= FALL_ANGLE:
+            raise ValueError(f"initial_angle={self.initial_angle!r} must be below pi/2")
+        periods = self.time_limit / self.control_period
+        if abs(periods - round(periods)) > 1e-9:
+            raise ValueError(
+                f"time_limit={self.time_limit!r} must be a whole number of "
+                f"control_period={self.control_period!r}"
+            )
+
+    @property
+    def steps(self) -> int:
+        """Control steps of an episode that runs to its limit."""
+        return round(self.time_limit / self.control_period)
+
+
+@dataclass(frozen=True)
+class CartPoleScenario:
+    """What an episode asks for.
+
+    Attributes:
+        initial_state: x(0), shape (4,).
+        goal: x_f, shape (4,).
+    """
+
+    initial_state: FloatArray
+    goal: FloatArray
+
+
+def sample_scenario(rng: np.random.Generator, settings: CartPoleSettings) -> CartPoleScenario:
+    """Draw x(0) = [0, theta_0, 0, 0] and x_f = [p_f, 0, 0, 0]."""
+    angle, position = rng.uniform(-1.0, 1.0, size=2)
+    initial_state, goal = np.zeros(STATE_DIM), np.zeros(STATE_DIM)
+    initial_state[1] = settings.initial_angle * angle
+    goal[0] = settings.goal_range * position
+    return CartPoleScenario(initial_state, goal)
+
+
+def scenario_from_options(options: dict[str, Any], drawn: CartPoleScenario) -> CartPoleScenario:
+    """Replace the drawn scenario by what `reset(options=...)` states.
+
+    Args:
+        options: May hold `initial_state` (4,) and `goal` ((4,), or p_f alone).
+        drawn: What to keep where the options are silent.
+
+    Returns:
+        The scenario of the episode.
+
+    Raises:
+        ValueError: A value has the wrong shape, is not finite, or starts fallen.
+    """
+    initial_state, goal = drawn.initial_state, drawn.goal
+    if "initial_state" in options:
+        initial_state = _vector("initial_state", options["initial_state"])
+        if abs(initial_state[1]) > FALL_ANGLE:
+            raise ValueError(
+                f"options['initial_state'] has angle {initial_state[1]:.3f} rad; "
+                "beyond pi/2 the pole has already fallen"
+            )
+    if "goal" in options:
+        value = options["goal"]
+        goal = _vector("goal", [value, 0.0, 0.0, 0.0] if np.ndim(value) == 0 else value)
+    return CartPoleScenario(initial_state, goal)
+
+
+def _vector(name: str, value: Any) -> FloatArray:
+    vector = np.array(value, dtype=np.float64)
+    if vector.shape != (STATE_DIM,) or not np.all(np.isfinite(vector)):
+        raise ValueError(f"options[{name!r}]={value!r} must be {STATE_DIM} finite numbers")
+    return vector
+
+
+def nominal_from_options(
+    options: dict[str, Any], settings: CartPoleSettings, batch: tuple[int, ...] = ()
+) -> FloatArray | None:
+    """Return x_d at every control instant, shape (*batch, steps + 1, 4), if the options hold it.
+
+    Raises:
+        ValueError: The trajectory has the wrong shape or is not finite.
+    """
+    value = options.get("nominal")
+    if value is None:
+        return None
+    nominal = np.asarray(value, dtype=np.float64)
+    wanted = (*batch, settings.steps + 1, STATE_DIM)
+    if nominal.shape != wanted or not np.all(np.isfinite(nominal)):
+        raise ValueError(
+            f"options['nominal'] has shape {nominal.shape}; it must be finite and of shape "
+            f"{wanted}, the nominal state at every control instant"
+        )
+    return nominal
+
+
+def named_space(settings: CartPoleSettings) -> spaces.Dict:
+    """Return the observation's named parts, in the order in which they are flattened.
+
+    The parts are `state` x, `goal` x_f and `initial_state` x(0), each (4,) in [m, rad, m/s, rad/s],
+    and `time` t, (1,) in [s].
+    """
+    # Rates are not bounded by the task; the largest float32 says so without an infinity, which
+    # Gymnasium's checker takes for a mistake.
+    widest = float(np.finfo(np.float32).max)
+
+    def box(low: list[float], high: list[float]) -> spaces.Box:
+        return spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
+
+    unbounded = ([-widest] * STATE_DIM, [widest] * STATE_DIM)
+    return spaces.Dict(
+        OrderedDict(
+            state=box(*unbounded),
+            goal=box(*unbounded),
+            initial_state=box(*unbounded),
+            time=box([0.0], [settings.time_limit]),
+        )
+    )
+
+
+def applied_force(settings: CartPoleSettings, action: Any, clip: Any) -> Any:
+    """Return the force of an action [N] (floats or arrays): scaled, then clipped to the limit."""
+    force = settings.force_scale * action
+    limit = settings.force_limit
+    return force if limit is None else clip(force, -limit, limit)
+
+
+def goal_distance(state: Any, goal: Any, sqrt: Any) -> Any:
+    """Return ||x - x_f|| from the components of both (floats or arrays)."""
+    total = 0.0
+    for here, there in zip(state, goal, strict=True):
+        total = total + (here - there) * (here - there)
+    return sqrt(total)
+
+
+def reward(
+    settings: CartPoleSettings, effort: Any, distance: Any, first_success: Any, fallen: Any
+) -> Any:
+    """Return the reward of one control step (floats or arrays).
+
+    Args:
+        settings: The task.
+        effort: ||u||^2 dt of the step [N^2 s].
+        distance: ||x - x_f|| after the step.
+        first_success: Whether the step brought the first success.
+        fallen: Whether the pole has fallen.
+
+    Returns:
+        -w_e ||u||^2 dt - w_d ||x - x_f|| dt + b_u dt [not fallen] + b_s [first success]. The
+        distance counts as at most b_u / w_d, so that a step upright never costs more than falling.
+    """
+    period = settings.control_period
+    reach = settings.upright_bonus - settings.distance_weight * distance
+    stay = period * (0.5 * (reach + abs(reach)))
+    return (
+        -settings.effort_weight * effort
+        + stay * (1 - fallen)
+        + settings.success_bonus * first_success
+    )

@@ -1,0 +1,260 @@
+"""Bounded disturbances: whatever the kind, the norm of d never exceeds the bound.
+
+A disturbance is constant over a control step. An open-loop kind draws the whole episode at reset,
+as a sequence in the unit ball that the bound then scales: a larger bound is the same realisation,
+larger. A feedback kind (`worst`, or any callable) looks at the state instead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+# (generator, steps, channels, control period [s]) -> sequence in the unit ball, (steps, channels).
+UnitSequence = Callable[[np.random.Generator, int, int, float], FloatArray]
+
+# Rounding must not carry a vector of norm one over the bound.
+_INSIDE = 1.0 - 4.0 * np.finfo(np.float64).eps
+_GUST_CORRELATION_TIME = 1.0  # [s]
+_GUST_SPREAD = 0.6  # stationary norm (root mean square) as a share of the bound, before clipping
+_SINUSOID_RATES = (0.5, 5.0)  # [rad/s]
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What a feedback disturbance may look at.
+
+    Attributes:
+        state: x, shape (..., n).
+        nominal: x_d at the same time, shape (..., n), or None if the episode has no plan.
+        time: t [s], shape (...).
+        direction: A unit vector drawn for the episode, shape (..., n).
+    """
+
+    state: FloatArray
+    nominal: FloatArray | None
+    time: FloatArray
+    direction: FloatArray
+
+
+Feedback = Callable[[Situation], FloatArray]
+
+
+def into_unit_ball(vectors: FloatArray) -> FloatArray:
+    """Shorten the vectors (..., n) that are longer than one to length one."""
+    norms = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    shortened: FloatArray = vectors * (_INSIDE / np.maximum(norms, _INSIDE))
+    return shortened
+
+
+def onto_unit_sphere(vectors: FloatArray, fallback: FloatArray) -> FloatArray:
+    """Scale the vectors (..., n) to length one; where one is zero take the fallback."""
+    norms = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    safe = np.where(norms > 0.0, norms, 1.0)
+    return np.where(norms > 0.0, vectors * (_INSIDE / safe), fallback)
+
+
+def _directions(rng: np.random.Generator, count: int, channels: int) -> FloatArray:
+    axis = np.zeros(channels)
+    axis[0] = _INSIDE
+    return onto_unit_sphere(rng.standard_normal((count, channels)), axis)
+
+
+def _none(rng: np.random.Generator, steps: int, channels: int, period: float) -> FloatArray:
+    return np.zeros((steps, channels))
+
+
+def _uniform(rng: np.random.Generator, steps: int, channels: int, period: float) -> FloatArray:
+    directions = _directions(rng, steps, channels)
+    return directions * rng.random((steps, 1)) ** (1.0 / channels)
+
+
+def _sphere(rng: np.random.Generator, steps: int, channels: int, period: float) -> FloatArray:
+    return _directions(rng, steps, channels)
+
+
+def _constant(rng: np.random.Generator, steps: int, channels: int, period: float) -> FloatArray:
+    return np.repeat(_directions(rng, 1, channels), steps, axis=0)
+
+
+def _sinusoid(rng: np.random.Generator, steps: int, channels: int, period: float) -> FloatArray:
+    direction = _directions(rng, 1, channels)
+    rate = rng.uniform(*_SINUSOID_RATES)
+    phase = rng.uniform(0.0, 2.0 * math.pi)
+    times = period * np.arange(steps)[:, None]
+    waves: FloatArray = direction * np.sin(rate * times + phase)
+    return waves
+
+
+def _gust(rng: np.random.Generator, steps: int, channels: int, period: float) -> FloatArray:
+    # Exact discretisation of an Ornstein-Uhlenbeck process, begun in its stationary law.
+    decay = math.exp(-period / _GUST_CORRELATION_TIME)
+    spread = _GUST_SPREAD / math.sqrt(channels)
+    shocks = spread * rng.standard_normal((steps, channels))
+    fresh = math.sqrt(1.0 - decay * decay)
+    path = np.empty_like(shocks)
+    value = shocks[0]
+    path[0] = value
+    for step in range(1, steps):
+        value = decay * value + fresh * shocks[step]
+        path[step] = value
+    return into_unit_ball(path)
+
+
+OPEN_LOOP: dict[str, UnitSequence] = {
+    "none": _none,
+    "uniform": _uniform,
+    "sphere": _sphere,
+    "constant": _constant,
+    "sinusoid": _sinusoid,
+    "gust": _gust,
+}
+KINDS = (*OPEN_LOOP, "worst")
+
+
+@dataclass(frozen=True)
+class WorstCase:
+    """Push along the gradient of e'Me, the direction in which the error energy grows fastest.
+
+    Attributes:
+        metric: M, shape (n, n), or a function of the states (..., n) that gives (..., n, n).
+    """
+
+    metric: FloatArray | Callable[[FloatArray], FloatArray]
+
+    def __call__(self, situation: Situation) -> FloatArray:
+        """Return M e, shape (..., n); the caller masks it and scales it to the bound.
+
+        Raises:
+            ValueError: The episode has no nominal trajectory.
+        """
+        if situation.nominal is None:
+            raise ValueError(
+                'disturbance="worst" needs the nominal trajectory x_d of the episode: '
+                'pass reset(options={"nominal": array of shape (steps + 1, n)})'
+            )
+        error = situation.state - situation.nominal
+        metric = self.metric(situation.state) if callable(self.metric) else self.metric
+        gradient = np.einsum("...ij,...j->...i", metric, error)
+        # An error of zero has no gradient: the direction of the episode breaks the tie.
+        return np.where(np.any(error != 0.0, axis=-1, keepdims=True), gradient, situation.direction)
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """A disturbance of one kind and bound on chosen channels of the state.
+
+    Attributes:
+        kind: A name of `KINDS`, or a function of the `Situation` whose value is projected onto the
+            ball and the channels.
+        bound: d_bar, the largest norm of d, in units of the state per second.
+        channels: Mask of the disturbed states, length n.
+        metric: M for the kind `worst`: an array (n, n) or a function of the state.
+
+    Raises:
+        ValueError: The kind is unknown, the bound is negative or not finite, the mask is empty, or
+            `worst` was asked for without a metric.
+    """
+
+    kind: str | Feedback
+    bound: float
+    channels: tuple[bool, ...]
+    metric: FloatArray | Callable[[FloatArray], FloatArray] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        if isinstance(self.kind, str) and self.kind not in KINDS:
+            raise ValueError(
+                f"disturbance={self.kind!r} is not known; use one of {', '.join(KINDS)} "
+                "or a callable"
+            )
+        if not (math.isfinite(self.bound) and self.bound >= 0.0):
+            raise ValueError(f"disturbance_bound={self.bound!r} must be finite and >= 0")
+        if not any(self.channels):
+            raise ValueError("channels must leave at least one state disturbed")
+        if self.kind == "worst" and self.metric is None:
+            raise ValueError(
+                'disturbance="worst" needs a contraction metric: pass metric=M, an array (n, n) or '
+                "a function of the state"
+            )
+
+    @property
+    def is_feedback(self) -> bool:
+        """Whether d depends on the state."""
+        return self.kind == "worst" or not isinstance(self.kind, str)
+
+    def realise(self, rng: np.random.Generator, steps: int, period: float) -> FloatArray:
+        """Draw the disturbance of one episode.
+
+        Args:
+            rng: The disturbance stream of the episode.
+            steps: Control steps of the episode.
+            period: Control period [s].
+
+        Returns:
+            Shape (steps, n). For an open-loop kind d at every step, of norm at most the bound; for
+            a feedback kind the unit direction of the episode, to be passed to `respond`.
+        """
+        mask = np.asarray(self.channels)
+        count = int(mask.sum())
+        # A feedback kind draws no sequence; its episode only needs one direction.
+        draw = _constant if self.is_feedback else OPEN_LOOP[cast(str, self.kind)]
+        sequence = np.zeros((steps, mask.size))
+        sequence[:, mask] = draw(rng, steps, count, period)
+        return sequence if self.is_feedback else self.bound * sequence
+
+    def respond(self, situation: Situation) -> FloatArray:
+        """Return d of a feedback kind, shape (..., n), of norm at most the bound.
+
+        Raises:
+            ValueError: The callable returned a wrong shape or a value that is not finite.
+        """
+        feedback = WorstCase(self.metric) if self.kind == "worst" else cast(Feedback, self.kind)  # type: ignore[arg-type]
+        push = np.asarray(feedback(situation), dtype=np.float64)
+        if push.shape != situation.state.shape or not np.all(np.isfinite(push)):
+            raise ValueError(
+                f"the disturbance callable returned shape {push.shape} (finite: "
+                f"{bool(np.all(np.isfinite(push)))}); it must return finite values of the state's "
+                f"shape {situation.state.shape}"
+            )
+        push = push * np.asarray(self.channels)
+        if self.kind == "worst":
+            return self.bound * onto_unit_sphere(push, situation.direction)
+        if self.bound == 0.0:
+            return np.zeros_like(push)
+        return self.bound * into_unit_ball(push / self.bound)
+
+
+def channel_mask(
+    channels: Literal["all", "rates"] | Sequence[bool], rates: tuple[bool, ...]
+) -> tuple[bool, ...]:
+    """Resolve the channel mask of a task.
+
+    Args:
+        channels: "all", "rates", or one boolean per state.
+        rates: Which states of the task are rates.
+
+    Returns:
+        One boolean per state.
+
+    Raises:
+        ValueError: The name is unknown or the mask has the wrong length.
+    """
+    if isinstance(channels, str):
+        if channels == "all":
+            return (True,) * len(rates)
+        if channels == "rates":
+            return rates
+        raise ValueError(f'disturbance_channels={channels!r} must be "all", "rates" or a mask')
+    mask = tuple(bool(flag) for flag in channels)
+    if len(mask) != len(rates):
+        raise ValueError(
+            f"disturbance_channels has {len(mask)} entries; the state has {len(rates)}"
+        )
+    return mask

@@ -1,0 +1,30 @@
+"""Equations of motion, written once, and what is derived from them.
+
+`cartpole` holds the physics; `dual` differentiates it; `integrate` holds a control over one step;
+`system` derives drift, control matrix, Jacobians and the SDC matrix for any system.
+"""
+
+from lagros_envs.dynamics.cartpole import CartPole
+from lagros_envs.dynamics.integrate import hold_step, linearise_hold
+from lagros_envs.dynamics.system import (
+    Components,
+    Functions,
+    System,
+    control_matrix,
+    jacobian,
+    state_dependent_coefficient,
+    vector_field,
+)
+
+__all__ = [
+    "CartPole",
+    "Components",
+    "Functions",
+    "System",
+    "control_matrix",
+    "hold_step",
+    "jacobian",
+    "linearise_hold",
+    "state_dependent_coefficient",
+    "vector_field",
+]

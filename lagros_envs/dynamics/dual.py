@@ -1,0 +1,124 @@
+"""Dual numbers: forward-mode derivatives of a function written for scalars.
+
+A `Dual` carries a value and its gradient along k seed directions. Passing duals and this module
+as the namespace of elementary functions through an equation of motion gives its exact Jacobian,
+so that no derivative of the physics is written by hand.
+"""
+
+from __future__ import annotations
+
+from typing import Union
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Number = Union["Dual", FloatArray, float]
+
+
+class Dual:
+    """A batch of values with gradients along k directions.
+
+    Attributes:
+        value: The values, shape (...).
+        gradient: Their derivatives, shape (k, ...).
+    """
+
+    __slots__ = ("gradient", "value")
+    # NumPy must leave `array * dual` to Dual.__rmul__ rather than build an object array.
+    __array_ufunc__ = None
+
+    def __init__(self, value: FloatArray, gradient: FloatArray) -> None:
+        """Pair a value with its gradient."""
+        self.value = value
+        self.gradient = gradient
+
+    def __add__(self, other: Number) -> Dual:
+        """Sum rule."""
+        if isinstance(other, Dual):
+            return Dual(self.value + other.value, self.gradient + other.gradient)
+        return Dual(self.value + other, self.gradient)
+
+    __radd__ = __add__
+
+    def __neg__(self) -> Dual:
+        """Sign change."""
+        return Dual(-self.value, -self.gradient)
+
+    def __sub__(self, other: Number) -> Dual:
+        """Difference rule."""
+        if isinstance(other, Dual):
+            return Dual(self.value - other.value, self.gradient - other.gradient)
+        return Dual(self.value - other, self.gradient)
+
+    def __rsub__(self, other: FloatArray | float) -> Dual:
+        """Difference with a constant on the left."""
+        return Dual(other - self.value, -self.gradient)
+
+    def __mul__(self, other: Number) -> Dual:
+        """Product rule."""
+        if isinstance(other, Dual):
+            gradient = self.gradient * other.value + other.gradient * self.value
+            return Dual(self.value * other.value, gradient)
+        return Dual(self.value * other, self.gradient * other)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Number) -> Dual:
+        """Quotient rule."""
+        if isinstance(other, Dual):
+            quotient = self.value / other.value
+            gradient = (self.gradient - other.gradient * quotient) / other.value
+            return Dual(quotient, gradient)
+        return Dual(self.value / other, self.gradient / other)
+
+    def __rtruediv__(self, other: FloatArray | float) -> Dual:
+        """Quotient of a constant by a dual."""
+        quotient = other / self.value
+        return Dual(quotient, -self.gradient * (quotient / self.value))
+
+
+def sin(angle: Dual) -> Dual:
+    """Return the sine of a dual."""
+    return Dual(np.sin(angle.value), angle.gradient * np.cos(angle.value))
+
+
+def cos(angle: Dual) -> Dual:
+    """Return the cosine of a dual."""
+    return Dual(np.cos(angle.value), angle.gradient * -np.sin(angle.value))
+
+
+def seed(arrays: list[FloatArray]) -> list[Dual]:
+    """Turn k arrays of one shape into duals that differentiate by each of them.
+
+    Args:
+        arrays: k arrays, each of shape (...).
+
+    Returns:
+        k duals; the gradient of the i-th is the i-th unit vector, shape (k, ...).
+    """
+    count = len(arrays)
+    duals = []
+    for index, array in enumerate(arrays):
+        gradient = np.zeros((count, *array.shape))
+        gradient[index] = 1.0
+        duals.append(Dual(array, gradient))
+    return duals
+
+
+def gradients(values: list[Number], count: int, shape: tuple[int, ...]) -> FloatArray:
+    """Stack the gradients of results into a Jacobian.
+
+    Args:
+        values: n results; one that does not depend on the seeds may be a plain number.
+        count: Number k of seeds.
+        shape: Batch shape.
+
+    Returns:
+        Jacobian of shape (*shape, n, k).
+    """
+    jacobian = np.zeros((*shape, len(values), count))
+    for row, value in enumerate(values):
+        if isinstance(value, Dual):
+            jacobian[..., row, :] = np.moveaxis(value.gradient, 0, -1)
+    return jacobian
