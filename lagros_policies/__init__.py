@@ -1,0 +1,1 @@
+"""Contraction theory, planning, imitation, and one module per policy."""

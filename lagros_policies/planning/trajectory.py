@@ -1,0 +1,51 @@
+"""A target trajectory, and how far it is from obeying the dynamics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from lagros_envs.dynamics import System, hold_step
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """(x_d, u_d) at the control instants.
+
+    Attributes:
+        states: x_d, shape (N + 1, n).
+        controls: u_d, held from one instant to the next, shape (N, m).
+        period: Control period [s].
+        solved: Whether the plan meets dynamics, constraints and terminal state.
+        status: Why the planner stopped, in words.
+        defect: Largest violation of the true dynamics at any step, in units of the state.
+        iterations: Convex programs solved.
+    """
+
+    states: FloatArray
+    controls: FloatArray
+    period: float
+    solved: bool
+    status: str
+    defect: float
+    iterations: int
+
+    @property
+    def horizon(self) -> int:
+        """Number N of control steps."""
+        return len(self.controls)
+
+    @property
+    def effort(self) -> float:
+        """The integral of ||u_d||^2 over the plan."""
+        return float(np.sum(self.controls**2) * self.period)
+
+
+def dynamics_defects(
+    system: System, states: FloatArray, controls: FloatArray, period: float
+) -> FloatArray:
+    """Return F(x_k, u_k) - x_{k+1} of the true Runge-Kutta dynamics, shape (N, n)."""
+    return hold_step(system, states[:-1], controls, period) - states[1:]
