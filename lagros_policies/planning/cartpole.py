@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from lagros_envs.cartpole_task import FALL_ANGLE, CartPoleSettings
-from lagros_envs.dynamics.cartpole import ANGLE
 from numpy.typing import NDArray
 
+from lagros_envs.cartpole_task import FALL_ANGLE, CartPoleSettings
+from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_policies.planning.scp import ScpSettings, ScpSolver
 from lagros_policies.planning.trajectory import Trajectory
 
@@ -34,7 +34,7 @@ class CartPolePlannerSettings:
 
     angle_margin: float = 0.4
     margin_rate: float = 0.6
-    scp: ScpSettings = ScpSettings()
+    scp: ScpSettings = field(default_factory=ScpSettings)
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -97,7 +97,7 @@ class CartPolePlanner:
                 f"start_step={start_step} leaves no step before the time limit "
                 f"({self.task.steps} steps)"
             )
-        times = (start_step + np.arange(1, horizon)) * self.task.control_period
+        times = self.task.control_period * np.arange(start_step + 1.0, self.task.steps)
         high = np.full((horizon - 1, 4), np.inf)
         high[:, ANGLE] = self.angle_limit(times)
         warm = None

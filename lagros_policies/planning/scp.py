@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from lagros_envs.dynamics import System, linearise_hold
 from numpy.typing import NDArray
 from scipy import sparse
 
+from lagros_envs.dynamics import System, linearise_hold
 from lagros_policies.planning.qp import UNBOUNDED, QuadraticProgram, solve_qp
 from lagros_policies.planning.trajectory import Trajectory, dynamics_defects
 
@@ -234,9 +234,7 @@ class ScpSolver:
         high = np.full(reference.size, UNBOUNDED)
         low[layout.states[:-1]], high[layout.states[:-1]] = bounds
         low[layout.states[-1]] = high[layout.states[-1]] = states[-1]
-        return QuadraticProgram(
-            diagonal, -weight * reference, equality, offset.ravel(), low, high
-        )
+        return QuadraticProgram(diagonal, -weight * reference, equality, offset.ravel(), low, high)
 
 
 def _clean(bound: FloatArray, absent: float) -> FloatArray:

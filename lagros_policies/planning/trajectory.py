@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from lagros_envs.dynamics import System, hold_step
 from numpy.typing import NDArray
+
+from lagros_envs.dynamics import System, hold_step
 
 FloatArray = NDArray[np.float64]
 

@@ -1,0 +1,41 @@
+"""Contraction metrics (CV-STEM), the robust control u* and the tubes that follow from them."""
+
+from lagros_policies.contraction.control import HeldControl, robust_control
+from lagros_policies.contraction.cvstem import (
+    CvStemSettings,
+    InfeasibleError,
+    Samples,
+    contraction_residual,
+    design_metric,
+    search_rate,
+    verify_metric,
+)
+from lagros_policies.contraction.metric import (
+    Metric,
+    Region,
+    Verification,
+    load_metric,
+    save_metric,
+)
+from lagros_policies.contraction.tube import Tube, certified_tube, diverging_bound, tighten
+
+__all__ = [
+    "CvStemSettings",
+    "HeldControl",
+    "InfeasibleError",
+    "Metric",
+    "Region",
+    "Samples",
+    "Tube",
+    "Verification",
+    "certified_tube",
+    "contraction_residual",
+    "design_metric",
+    "diverging_bound",
+    "load_metric",
+    "robust_control",
+    "save_metric",
+    "search_rate",
+    "tighten",
+    "verify_metric",
+]

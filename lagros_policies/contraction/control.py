@@ -1,0 +1,152 @@
+"""The robust tracking control u* of Theorem 2: the least deviation that makes e'Me contract."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.dynamics import System, control_matrix, hold_step, linearise_hold, vector_field
+from lagros_policies.contraction.metric import Metric
+
+FloatArray = NDArray[np.float64]
+
+
+def error_energy(matrix: FloatArray, error: FloatArray) -> FloatArray:
+    """Return V = e'Me, shape (...), for M (..., n, n) and e (..., n)."""
+    energy: FloatArray = np.einsum("...i,...ij,...j->...", error, matrix, error)
+    return energy
+
+
+def contraction_terms(
+    system: System,
+    metric: Metric,
+    rate: float,
+    state: FloatArray,
+    nominal: FloatArray,
+    nominal_control: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return phi_0 and phi_1: the condition (18) at K e = v reads phi_0 + phi_1'v <= 0.
+
+    phi_0 = 2e'M(f(x) + B(x)u_d - f(x_d) - B(x_d)u_d) + e'(dM/dt + 2 alpha M)e, phi_1 = 2B(x)'Me.
+
+    Args:
+        system: The system.
+        metric: The metric.
+        rate: alpha of the control law, at most the metric's own [1/s].
+        state: x, shape (..., n).
+        nominal: x_d, shape (..., n).
+        nominal_control: u_d, shape (..., m).
+
+    Returns:
+        phi_0, shape (...), and phi_1, shape (..., m).
+    """
+    error = state - nominal
+    matrix = metric.matrix(state)
+    pull = np.einsum("...ij,...j->...i", matrix, error)
+    drift = vector_field(system, state, nominal_control)
+    drift = drift - vector_field(system, nominal, nominal_control)
+    phi_0 = 2.0 * np.einsum("...i,...i->...", pull, drift + rate * error)
+    phi_0 = phi_0 + error_energy(metric.matrix_rate(state), error)
+    phi_1 = 2.0 * np.einsum("...ij,...i->...j", control_matrix(system, state), pull)
+    return phi_0, phi_1
+
+
+def robust_control(
+    system: System,
+    metric: Metric,
+    rate: float,
+    state: FloatArray,
+    nominal: FloatArray,
+    nominal_control: FloatArray,
+) -> FloatArray:
+    """Return u* of Theorem 2 in closed form: u_d - max(phi_0, 0) phi_1 / ||phi_1||^2.
+
+    Where phi_1 vanishes the control cannot change the energy; phi_0 <= 0 holds there inside the
+    metric's region, and u_d is returned.
+
+    Args:
+        system: The system.
+        metric: The metric.
+        rate: alpha of the control law [1/s].
+        state: x, shape (..., n).
+        nominal: x_d, shape (..., n).
+        nominal_control: u_d, shape (..., m).
+
+    Returns:
+        u*, shape (..., m).
+    """
+    phi_0, phi_1 = contraction_terms(system, metric, rate, state, nominal, nominal_control)
+    size = np.einsum("...i,...i->...", phi_1, phi_1)
+    acts = (phi_0 > 0.0) & (size > 0.0)
+    gain = np.where(acts, phi_0 / np.where(size > 0.0, size, 1.0), 0.0)
+    control: FloatArray = nominal_control - gain[..., None] * phi_1
+    return control
+
+
+@dataclass(frozen=True)
+class HeldControl:
+    """u* for a control that is held: V must fall by exp(-2 alpha dt) from one instant to the next.
+
+    The continuous law asks for dV/dt <= -2 alpha V at the instant only; over a hold of 0.1 s the
+    energy then overshoots. Here the next error is predicted by the Runge-Kutta map F, linear in
+    the deviation v = u - u_d, and v is the least with
+
+        (e' + G v)' M(x') (e' + G v) <= exp(-2 alpha dt) e'Me,  e' = F(x, u_d) - F(x_d, u_d),
+
+    G = dF/du(x, u_d), x' = F(x, u_d). One control, so the condition is a quadratic in v and the
+    least root is closed form. Where no v meets it, the v of least energy is taken.
+
+    Attributes:
+        system: A system with one control.
+        metric: The metric.
+        rate: alpha of the control law [1/s].
+        period: Control period dt [s].
+
+    Raises:
+        ValueError: The system has more than one control.
+    """
+
+    system: System
+    metric: Metric
+    rate: float
+    period: float
+
+    def __post_init__(self) -> None:
+        """Check the system."""
+        if self.system.control_dim != 1:
+            raise ValueError(
+                f"HeldControl is closed form for one control, not {self.system.control_dim}; "
+                "use robust_control"
+            )
+
+    def quadratic(
+        self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return a, b, c, each (...): the condition reads a v^2 + 2 b v + c <= 0."""
+        following, _, slope = linearise_hold(self.system, state, nominal_control, self.period)
+        error = following - hold_step(self.system, nominal, nominal_control, self.period)
+        matrix = self.metric.matrix(following)
+        gain = slope[..., 0]
+        pull = np.einsum("...ij,...j->...i", matrix, gain)
+        a: FloatArray = np.einsum("...i,...i->...", gain, pull)
+        b: FloatArray = np.einsum("...i,...i->...", error, pull)
+        before = error_energy(self.metric.matrix(state), state - nominal)
+        c = error_energy(matrix, error) - np.exp(-2.0 * self.rate * self.period) * before
+        return a, b, c
+
+    def __call__(
+        self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
+    ) -> FloatArray:
+        """Return u*, shape (..., 1), for x (..., n), x_d (..., n), u_d (..., 1)."""
+        a, b, c = self.quadratic(state, nominal, nominal_control)
+        root = np.sqrt(np.maximum(b * b - a * c, 0.0))
+        # c > 0: both roots have the sign of -b; the smaller one, without cancellation.
+        far = b + np.copysign(root, b)
+        feasible = b * b >= a * c
+        safe = np.where(far == 0.0, 1.0, far)
+        least = np.where(feasible & (far != 0.0), -c / safe, -b / a)
+        deviation = np.where(c > 0.0, least, 0.0)
+        control: FloatArray = nominal_control + deviation[..., None]
+        return control

@@ -1,0 +1,391 @@
+"""CV-STEM: the contraction metric with the least steady-state tube, as one semidefinite program.
+
+Theorem 2, equations (14)-(16): over W_bar(theta) = sum_i W_i cos(theta)^i, nu and chi,
+
+    min chi + lambda nu
+    s.t. -dW_bar/dt + 2 sym(A W_bar) - 2 nu B B' <= -2 (alpha + margin) W_bar   at every sample
+         I <= W_bar <= chi I                                                    at every angle
+
+with one (nu, chi) for all samples, in scaled states z = S x. cvxpy states the same problem in the
+tests; here the matrices go to Clarabel directly, which spares the compilation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from lagros_envs.dynamics import System, control_matrix, state_dependent_coefficient
+from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
+from lagros_policies.contraction.metric import (
+    Metric,
+    Region,
+    Verification,
+    basis,
+    basis_rate,
+)
+
+FloatArray = NDArray[np.float64]
+
+
+# Angles at which I <= W_bar(theta) <= chi I is imposed.
+_BOUND_ANGLES = 25
+
+
+class InfeasibleError(ValueError):
+    """The condition has no solution for the asked rate and region."""
+
+
+@dataclass(frozen=True)
+class CvStemSettings:
+    """What to design.
+
+    Attributes:
+        contraction_rate: alpha [1/s].
+        degree: Degree of W_bar in cos(theta); 0 is a constant metric.
+        control_penalty: lambda, the weight of nu; zero is ill-posed.
+        margin: Added to alpha at the samples, so that the condition holds between them [1/s].
+        scaling: Diagonal of S, the units in which chi is measured, one per state.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    contraction_rate: float = 0.6
+    degree: int = 0
+    control_penalty: float = 1e-2
+    margin: float = 0.02
+    scaling: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not (math.isfinite(self.contraction_rate) and self.contraction_rate > 0.0):
+            raise ValueError(f"contraction_rate={self.contraction_rate!r} must be positive")
+        if self.degree < 0:
+            raise ValueError(f"degree={self.degree!r} must be >= 0")
+        if not self.control_penalty > 0.0:
+            raise ValueError(
+                f"control_penalty={self.control_penalty!r} must be > 0: without it nu is unbounded"
+            )
+        if self.margin < 0.0 or not all(value > 0.0 for value in self.scaling):
+            raise ValueError("margin must be >= 0 and every scaling > 0")
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Triples at which the condition is imposed or checked.
+
+    Attributes:
+        state: x, shape (s, n).
+        nominal: x_d, shape (s, n).
+        nominal_control: u_d, shape (s, m).
+    """
+
+    state: FloatArray
+    nominal: FloatArray
+    nominal_control: FloatArray
+
+    def take(self, index: NDArray[np.intp]) -> Samples:
+        """Return the samples with these indices."""
+        return Samples(self.state[index], self.nominal[index], self.nominal_control[index])
+
+
+def design_metric(
+    system: System, samples: Samples, region: Region, settings: CvStemSettings
+) -> Metric:
+    """Solve the joint CV-STEM program over samples.
+
+    Args:
+        system: The system.
+        samples: Where the condition is imposed.
+        region: The region that the samples cover, stored with the metric.
+        settings: What to design.
+
+    Returns:
+        The metric, not yet verified.
+
+    Raises:
+        InfeasibleError: No metric exists for this alpha, region and degree.
+        RuntimeError: The solver stopped for another reason.
+    """
+    problem = _assemble(system, samples, region, settings)
+    values, status = _solve(problem)
+    if status in ("PrimalInfeasible", "AlmostPrimalInfeasible"):
+        raise InfeasibleError(
+            f"no contraction metric of degree {settings.degree} with "
+            f"alpha={settings.contraction_rate} (margin {settings.margin}) exists on {region}: "
+            "lower alpha or the margin, raise the degree, or shrink the region"
+        )
+    if values is None:
+        raise RuntimeError(
+            f"CV-STEM stopped with status {status} for alpha={settings.contraction_rate} on "
+            f"{region}; try another control_penalty or scaling"
+        )
+    scale = 1.0 / np.asarray(settings.scaling)
+    scaled = np.einsum(
+        "ij,jkl->ikl", values[:-2].reshape(settings.degree + 1, -1), problem.symmetric
+    )
+    return Metric(
+        coefficients=scaled * scale[:, None] * scale[None, :],
+        contraction_rate=settings.contraction_rate,
+        condition_bound=float(values[-1]),
+        control_weight=float(values[-2]),
+        scaling=np.asarray(settings.scaling),
+        region=region,
+    )
+
+
+def design_on_pool(
+    system: System,
+    pool: Samples,
+    region: Region,
+    settings: CvStemSettings,
+    first: int = 60,
+    rounds: int = 20,
+) -> Metric:
+    """Design a metric whose condition holds on a whole pool, imposing it where it binds.
+
+    A program over thousands of samples is slow and almost all of its cones are slack. Start from
+    the first few, then add the samples of the pool that the metric violates most, and repeat.
+
+    Args:
+        system: The system.
+        pool: Samples that the metric must satisfy.
+        region: The region that the pool covers.
+        settings: What to design; the condition must hold on the pool for alpha itself, the margin
+            is imposed on the active samples.
+        first: Samples to begin with.
+        rounds: Programs at most.
+
+    Returns:
+        The metric; it satisfies the condition on the pool.
+
+    Raises:
+        InfeasibleError: No metric exists for this alpha, region and degree.
+        RuntimeError: The pool was not satisfied within the rounds.
+    """
+    active = np.arange(min(first, len(pool.state)))
+    worst = math.inf
+    for _ in range(rounds):
+        metric = design_metric(system, pool.take(active), region, settings)
+        residual = contraction_residual(system, metric, pool)
+        worst = float(residual.max())
+        if worst <= 0.0:
+            return metric
+        order = np.argsort(residual)[::-1]
+        active = np.union1d(active, order[: min(first, int(np.sum(residual > 0.0)))])
+    raise RuntimeError(
+        f"after {rounds} programs the condition still fails by {worst:.2e} 1/s on the pool: raise "
+        "the margin, which closes the gaps between samples"
+    )
+
+
+def search_rate(
+    system: System,
+    samples: Samples,
+    region: Region,
+    settings: CvStemSettings,
+    rates: Sequence[float],
+) -> tuple[Metric, list[tuple[float, float]]]:
+    """Line search over alpha for the least steady-state tube per unit of disturbance.
+
+    Args:
+        system: The system.
+        samples: Where the condition is imposed.
+        region: The region that the samples cover.
+        settings: What to design; its rate is replaced.
+        rates: Values of alpha to try [1/s].
+
+    Returns:
+        The best metric and the curve of (alpha, sqrt(chi)/alpha); infinite where infeasible.
+
+    Raises:
+        InfeasibleError: Every rate is infeasible.
+    """
+    best: Metric | None = None
+    curve: list[tuple[float, float]] = []
+    least = math.inf
+    for rate in rates:
+        try:
+            metric = design_metric(
+                system, samples, region, replace(settings, contraction_rate=rate)
+            )
+        except InfeasibleError:
+            curve.append((rate, math.inf))
+            continue
+        radius = math.sqrt(metric.condition_bound) / rate
+        curve.append((rate, radius))
+        if radius < least:
+            best, least = metric, radius
+    if best is None:
+        raise InfeasibleError(
+            f"no alpha of {list(rates)} is feasible on {region}: shrink the region or lower alpha"
+        )
+    return best, curve
+
+
+def contraction_residual(system: System, metric: Metric, samples: Samples) -> FloatArray:
+    """Return by how much the condition fails at each sample, relative to W_bar, shape (s,).
+
+    The largest eigenvalue of W_bar^-1/2 (-dW_bar/dt + 2 sym(A W_bar) - 2 nu B B'
+    + 2 alpha W_bar) W_bar^-1/2, in 1/s: the condition holds where it is not positive.
+    """
+    left = _condition(system, metric, samples)
+    values, vectors = np.linalg.eigh(metric.dual(samples.state))
+    if values.min() <= 0.0:
+        # Not a metric at all somewhere: no residual is large enough.
+        return np.where(values[:, 0] > 0.0, -np.inf, np.inf)
+    root = np.swapaxes(vectors / np.sqrt(values)[:, None, :], -1, -2)
+    relative = root @ left @ np.swapaxes(root, -1, -2)
+    return np.asarray(np.linalg.eigvalsh(relative)[..., -1], dtype=np.float64)
+
+
+def verify_metric(system: System, metric: Metric, samples: Samples, seed: int) -> Metric:
+    """Check the condition and I <= W_bar <= chi I on fresh samples and store the outcome.
+
+    Args:
+        system: The system.
+        metric: The metric.
+        samples: States that the design never saw.
+        seed: The seed they were drawn with, for the record.
+
+    Returns:
+        The metric with its `verification`.
+    """
+    residual = contraction_residual(system, metric, samples)
+    scaled = metric.dual(samples.state) * metric.scaling[:, None] * metric.scaling[None, :]
+    eigenvalues = np.linalg.eigvalsh(scaled)
+    # The semidefinite solver meets the bounds to about 1e-7 of chi.
+    slack = 1e-6 * metric.condition_bound
+    bounded = (eigenvalues[:, 0] >= 1.0 - slack) & (
+        eigenvalues[:, -1] <= metric.condition_bound + slack
+    )
+    broken = int(np.sum((residual > 0.0) | ~bounded))
+    check = Verification(len(residual), broken, float(residual.max()), seed)
+    return replace(metric, verification=check)
+
+
+def _condition(system: System, metric: Metric, samples: Samples) -> FloatArray:
+    slope = state_dependent_coefficient(
+        system, samples.state, samples.nominal, samples.nominal_control
+    )
+    gain = control_matrix(system, samples.state)
+    dual = metric.dual(samples.state)
+    product = slope @ dual
+    left: FloatArray = (
+        -metric.dual_rate(samples.state)
+        + product
+        + np.swapaxes(product, -1, -2)
+        - 2.0 * metric.control_weight * gain @ np.swapaxes(gain, -1, -2)
+        + 2.0 * metric.contraction_rate * dual
+    )
+    return left
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """min cost'z subject to right - rows z in a product of semidefinite cones of size n."""
+
+    cost: FloatArray
+    rows: sparse.csc_matrix
+    right: FloatArray
+    cones: int
+    n: int
+    symmetric: FloatArray  # basis of the symmetric matrices, (n(n+1)/2, n, n)
+
+
+def _symmetric_basis(n: int) -> FloatArray:
+    places = [(i, j) for j in range(n) for i in range(j + 1)]
+    matrices = np.zeros((len(places), n, n))
+    for index, (i, j) in enumerate(places):
+        matrices[index, i, j] = matrices[index, j, i] = 1.0
+    return matrices
+
+
+def _svec(matrices: FloatArray) -> FloatArray:
+    """Stack upper triangles by columns, off-diagonals times sqrt(2): Clarabel's cone order."""
+    n = matrices.shape[-1]
+    rows = np.concatenate([np.arange(j + 1) for j in range(n)])
+    columns = np.concatenate([np.full(j + 1, j) for j in range(n)])
+    weight = np.where(rows == columns, 1.0, math.sqrt(2.0))
+    stacked: FloatArray = matrices[..., rows, columns] * weight
+    return stacked
+
+
+def _assemble(
+    system: System, samples: Samples, region: Region, settings: CvStemSettings
+) -> _Problem:
+    scale = np.asarray(settings.scaling)
+    slope = state_dependent_coefficient(
+        system, samples.state, samples.nominal, samples.nominal_control
+    )
+    slope = slope * scale[:, None] / scale[None, :]
+    gain = control_matrix(system, samples.state) * scale[:, None]
+    n = scale.size
+    symmetric = _symmetric_basis(n)
+    angle, rate = samples.state[:, ANGLE], samples.state[:, ANGULAR_RATE]
+    powers = basis(angle, settings.degree)
+    power_rates = basis_rate(angle, rate, settings.degree)
+    # d/dW_ij of the condition's left side, (s, degree + 1, basis, n, n).
+    product = np.einsum("sab,jbc->sjac", slope, symmetric)
+    both = product + np.swapaxes(product, -1, -2)
+    decay = 2.0 * (settings.contraction_rate + settings.margin)
+    by_dual = powers[:, :, None, None, None] * (both + decay * symmetric)[:, None]
+    by_dual -= power_rates[:, :, None, None, None] * symmetric
+    by_weight = -2.0 * gain @ np.swapaxes(gain, -1, -2)
+    blocks = [_block(by_dual, by_weight, None)]
+    rights = [np.zeros(blocks[0].shape[0])]
+    # The bounds depend on the angle alone, which a grid covers; a constant metric needs one point.
+    grid = np.linspace(0.0, region.angle, _BOUND_ANGLES if settings.degree else 1)
+    bound_powers = basis(grid, settings.degree)
+    spread = bound_powers[:, :, None, None, None] * symmetric
+    unit = np.broadcast_to(np.eye(n), (len(bound_powers), n, n))
+    blocks.append(_block(-spread, None, None))
+    rights.append(-_svec(unit).ravel())
+    blocks.append(_block(spread, None, -unit))
+    rights.append(np.zeros(blocks[-1].shape[0]))
+    cost = np.zeros(by_dual.shape[1] * by_dual.shape[2] + 2)
+    cost[-2:] = settings.control_penalty, 1.0
+    rows = sparse.csc_matrix(np.vstack(blocks))
+    cones = len(samples.state) + 2 * len(bound_powers)
+    return _Problem(cost, rows, np.concatenate(rights), cones, n, symmetric)
+
+
+def _block(
+    by_dual: FloatArray, by_weight: FloatArray | None, by_condition: FloatArray | None
+) -> FloatArray:
+    """Rows of one family of cones: columns for every W_ij, then nu, then chi."""
+    count = len(by_dual)
+    dual = _svec(by_dual)
+    height = dual.shape[-1]
+    dual = np.moveaxis(dual, -1, 1).reshape(count * height, -1)
+    zero = np.zeros((count * height, 1))
+    weight = zero if by_weight is None else _svec(by_weight).reshape(-1, 1)
+    condition = zero if by_condition is None else _svec(by_condition).reshape(-1, 1)
+    return np.hstack([dual, weight, condition])
+
+
+def _solve(problem: _Problem) -> tuple[FloatArray | None, str]:
+    import clarabel
+
+    settings: Any = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.max_threads = 1
+    cones = [clarabel.PSDTriangleConeT(problem.n)] * problem.cones
+    size = problem.cost.size
+    quadratic = sparse.csc_matrix((size, size))
+    solver = clarabel.DefaultSolver(
+        quadratic, problem.cost, problem.rows, problem.right, cones, settings
+    )
+    answer = solver.solve()
+    status = str(answer.status)
+    # An almost solved program is accepted only because every metric is verified afterwards.
+    if status not in ("Solved", "AlmostSolved"):
+        return None, status
+    return np.array(answer.x), status

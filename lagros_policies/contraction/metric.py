@@ -1,0 +1,234 @@
+"""A contraction metric: what it is, where it was verified, and how it is stored."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_FORMAT = "lagros-metric-1"
+
+
+@dataclass(frozen=True)
+class Region:
+    """The states and errors for which a cart-pole metric was designed and checked.
+
+    The metric does not depend on the position, nor does the pole's motion on the cart's speed, so
+    neither is bounded.
+
+    Attributes:
+        angle: Largest |theta| of x and of x_d [rad].
+        angular_rate: Largest |dtheta/dt| of x and of x_d [rad/s].
+        angle_error: Largest |theta - theta_d| [rad].
+        angular_rate_error: Largest error of the rate [rad/s].
+        force: Largest |u_d| [N].
+
+    Raises:
+        ValueError: A bound is not positive, or the angle reaches pi/2.
+    """
+
+    angle: float = 1.15
+    angular_rate: float = 4.0
+    angle_error: float = 0.35
+    angular_rate_error: float = 2.0
+    force: float = 40.0
+
+    def __post_init__(self) -> None:
+        """Check the bounds."""
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name}={value!r} must be positive and finite")
+        if self.angle >= math.pi / 2:
+            raise ValueError(
+                f"angle={self.angle!r} must be below pi/2, where the force loses its authority"
+            )
+
+    def contains(
+        self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
+    ) -> BoolArray:
+        """Return which triples (x, x_d, u_d) of a batch (..., 4), (..., 4), (..., 1) lie inside."""
+        error = np.abs(state - nominal)
+        inside = np.abs(nominal_control[..., 0]) <= self.force
+        for point in (state, nominal):
+            inside &= np.abs(point[..., ANGLE]) <= self.angle
+            inside &= np.abs(point[..., ANGULAR_RATE]) <= self.angular_rate
+        inside &= error[..., ANGLE] <= self.angle_error
+        inside &= error[..., ANGULAR_RATE] <= self.angular_rate_error
+        return inside
+
+
+@dataclass(frozen=True)
+class Verification:
+    """An independent check of the metric on states that the design never saw (observed).
+
+    Attributes:
+        samples: States checked.
+        violations: How many of them break the contraction condition.
+        worst: Largest eigenvalue of the condition's left side, relative to W_bar; negative holds.
+        seed: Seed of the states.
+    """
+
+    samples: int
+    violations: int
+    worst: float
+    seed: int
+
+
+@dataclass(frozen=True)
+class Metric:
+    """W_bar(theta) = sum_i W_i cos(theta)^i, with M = nu W_bar^-1 (Theorem 2).
+
+    Every use of M here is invariant to its scale, so M is given without the factor nu.
+
+    Attributes:
+        coefficients: W_i, shape (degree + 1, n, n), symmetric.
+        contraction_rate: alpha [1/s].
+        condition_bound: chi, with I <= S W_bar S <= chi I for the scaling S.
+        control_weight: nu, the weight of B B' in the condition.
+        scaling: Diagonal of S, the units in which chi is measured, shape (n,).
+        region: Where the metric was designed.
+        verification: The independent check, or None.
+
+    Raises:
+        ValueError: The arrays do not fit each other or are not symmetric.
+    """
+
+    coefficients: FloatArray
+    contraction_rate: float
+    condition_bound: float
+    control_weight: float
+    scaling: FloatArray
+    region: Region
+    verification: Verification | None = None
+
+    def __post_init__(self) -> None:
+        """Check the arrays."""
+        shape = self.coefficients.shape
+        if len(shape) != 3 or shape[1] != shape[2] or self.scaling.shape != shape[1:2]:
+            raise ValueError(
+                f"coefficients of shape {shape} and scaling of shape {self.scaling.shape} "
+                "must be (degree + 1, n, n) and (n,)"
+            )
+        if not np.allclose(self.coefficients, np.swapaxes(self.coefficients, 1, 2)):
+            raise ValueError("every coefficient of W_bar must be symmetric")
+
+    @property
+    def degree(self) -> int:
+        """Degree of W_bar in cos(theta)."""
+        return len(self.coefficients) - 1
+
+    def dual(self, state: FloatArray) -> FloatArray:
+        """Return W_bar(x), shape (..., n, n), for states (..., n)."""
+        powers = np.cos(state[..., ANGLE])[..., None] ** np.arange(self.degree + 1)
+        value: FloatArray = np.einsum("...i,ijk->...jk", powers, self.coefficients)
+        return value
+
+    def dual_rate(self, state: FloatArray) -> FloatArray:
+        """Return dW_bar/dt along dtheta/dt of the state, shape (..., n, n)."""
+        value: FloatArray = np.einsum(
+            "...i,ijk->...jk",
+            basis_rate(state[..., ANGLE], state[..., ANGULAR_RATE], self.degree),
+            self.coefficients,
+        )
+        return value
+
+    def matrix(self, state: FloatArray) -> FloatArray:
+        """Return M(x) = W_bar(x)^-1, shape (..., n, n), for states (..., n)."""
+        return np.asarray(np.linalg.inv(self.dual(state)), dtype=np.float64)
+
+    def matrix_rate(self, state: FloatArray) -> FloatArray:
+        """Return dM/dt = -M (dW_bar/dt) M, shape (..., n, n)."""
+        matrix = self.matrix(state)
+        return -matrix @ self.dual_rate(state) @ matrix
+
+    def extreme_eigenvalues(self, points: int = 401) -> tuple[float, float]:
+        """Return the extreme eigenvalues of M over a grid of the region's angles (observed)."""
+        states = np.zeros((points, len(self.scaling)))
+        states[:, ANGLE] = np.linspace(0.0, self.region.angle, points)
+        values = np.linalg.eigvalsh(self.matrix(states))
+        return float(values.min()), float(values.max())
+
+
+def basis(angle: FloatArray, degree: int) -> FloatArray:
+    """Return cos(theta)^i for i = 0 ... degree, shape (..., degree + 1)."""
+    powers: FloatArray = np.cos(angle)[..., None] ** np.arange(degree + 1)
+    return powers
+
+
+def basis_rate(angle: FloatArray, angular_rate: FloatArray, degree: int) -> FloatArray:
+    """Return the time derivative of the basis, shape (..., degree + 1)."""
+    exponents = np.arange(degree + 1)
+    lower = np.cos(angle)[..., None] ** np.maximum(exponents - 1, 0)
+    rates: FloatArray = -exponents * lower * (np.sin(angle) * angular_rate)[..., None]
+    return rates
+
+
+def save_metric(metric: Metric, path: Path | str) -> None:
+    """Write a metric as JSON, atomically; numbers keep every bit."""
+    record: dict[str, Any] = {
+        "format": _FORMAT,
+        "basis": "cos(theta)^i",
+        "coefficients": metric.coefficients.tolist(),
+        "alpha": metric.contraction_rate,
+        "chi": metric.condition_bound,
+        "nu": metric.control_weight,
+        "scaling": metric.scaling.tolist(),
+        "region": {name: getattr(metric.region, name) for name in Region.__dataclass_fields__},
+        "verification": None
+        if metric.verification is None
+        else {
+            name: getattr(metric.verification, name) for name in Verification.__dataclass_fields__
+        },
+    }
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".tmp")
+    with os.fdopen(handle, "w") as file:
+        json.dump(record, file, indent=1)
+    os.replace(temporary, path)
+
+
+def load_metric(path: Path | str | None = None) -> Metric:
+    """Read a metric.
+
+    Args:
+        path: A file written by `save_metric`; None for the shipped cart-pole metric.
+
+    Returns:
+        The metric.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is not a metric, or is damaged.
+    """
+    if path is None:
+        path = Path(__file__).parents[1] / "pretrained" / "cartpole_metric.json"
+    try:
+        record = json.loads(Path(path).read_text())
+        if record["format"] != _FORMAT:
+            raise ValueError(f"format {record['format']!r} is not {_FORMAT!r}")
+        check = record["verification"]
+        return Metric(
+            coefficients=np.array(record["coefficients"], dtype=np.float64),
+            contraction_rate=float(record["alpha"]),
+            condition_bound=float(record["chi"]),
+            control_weight=float(record["nu"]),
+            scaling=np.array(record["scaling"], dtype=np.float64),
+            region=Region(**record["region"]),
+            verification=None if check is None else Verification(**check),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is not a metric written by save_metric: {error}") from error

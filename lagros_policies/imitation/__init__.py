@@ -1,0 +1,1 @@
+"""Algorithm 1: expert data in the tube, networks, training."""

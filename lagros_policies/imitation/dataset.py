@@ -1,0 +1,300 @@
+"""Algorithm 1: random episodes, target trajectories, states in their tubes, labels u*.
+
+The work is cut into shards that depend on nothing but the settings and their index. A shard is
+written under a temporary name and renamed, so that whatever interrupts the work, every finished
+shard survives and the rest is made again, bit for bit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs import cartpole_task as task
+from lagros_envs.disturbances import OPEN_LOOP, into_unit_ball
+from lagros_envs.dynamics import hold_step
+from lagros_envs.seeding import episode_seeds, episode_streams
+from lagros_policies.contraction import Metric
+from lagros_policies.expert import CartPoleExpert
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+# Kinds of disturbance whose closed loops fill the tube; `none` would only repeat the plan.
+_KINDS = ("uniform", "sphere", "constant", "sinusoid", "gust")
+
+
+@dataclass(frozen=True, slots=True)
+class ExpertDataSettings:
+    """What to generate.
+
+    Attributes:
+        plans: Random episodes, each with one target trajectory.
+        samples: Labelled states in all.
+        shards: Pieces of work.
+        disturbance_bound: Largest d_bar of the closed loops that fill the tube.
+        spread: Radius of the ball added to every state, in units of d_bar times the control
+            period: one more step of disturbance.
+        seed: Seed of the run.
+
+    Raises:
+        ValueError: A value is out of range, or the shards do not divide plans and samples.
+    """
+
+    plans: int = 1000
+    samples: int = 50_000
+    shards: int = 20
+    disturbance_bound: float = 1.0
+    spread: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.shards < 1 or self.plans % self.shards or self.samples % self.shards:
+            raise ValueError(
+                f"shards={self.shards} must divide plans={self.plans} and samples={self.samples}"
+            )
+        if min(self.plans, self.samples) < 1 or self.disturbance_bound < 0.0 or self.spread < 0.0:
+            raise ValueError("plans and samples must be positive, bound and spread >= 0")
+
+
+@dataclass(frozen=True)
+class ExpertData:
+    """Labelled states and the plans they lie around.
+
+    Attributes:
+        observation: What the policy sees at the state, shape (s, 13).
+        control: u*, shape (s, 1) [N].
+        plan: Which plan each sample belongs to, shape (s,).
+        plan_states: x_d, shape (p, N + 1, 4).
+        plan_controls: u_d, shape (p, N, 1) [N].
+        drawn: States drawn in all, with those outside the verified region.
+    """
+
+    observation: FloatArray
+    control: FloatArray
+    plan: IntArray
+    plan_states: FloatArray
+    plan_controls: FloatArray
+    drawn: int
+
+    def nominal_pairs(self, settings: task.CartPoleSettings) -> tuple[FloatArray, FloatArray]:
+        """Return the observations along the plans, (p N, 13), and u_d, (p N, 1): data of (a)."""
+        steps = np.tile(np.arange(settings.steps), len(self.plan_states))
+        plan = np.repeat(np.arange(len(self.plan_states)), settings.steps)
+        states = self.plan_states[plan, steps]
+        observation = observations(states, self.plan_states[plan], steps, settings)
+        return observation, self.plan_controls[plan, steps]
+
+
+def observations(
+    states: FloatArray, plans: FloatArray, steps: IntArray, settings: task.CartPoleSettings
+) -> FloatArray:
+    """Return what the environment shows at states (s, 4) of episodes with plans (s, N + 1, 4)."""
+    observation = np.empty((len(states), task.OBSERVATION_DIM))
+    observation[:, task.STATE] = states
+    observation[:, task.GOAL] = plans[:, -1]
+    observation[:, task.INITIAL_STATE] = plans[:, 0]
+    observation[:, task.TIME] = steps * settings.control_period
+    return observation
+
+
+def generate(
+    folder: Path,
+    metric: Metric,
+    settings: ExpertDataSettings,
+    task_settings: task.CartPoleSettings | None = None,
+    jobs: int = 1,
+    on_shard: Callable[[int], None] | None = None,
+) -> ExpertData:
+    """Generate expert data, or finish what an interrupted call began.
+
+    Args:
+        folder: Where the shards are kept.
+        metric: The contraction metric behind u*.
+        settings: What to generate.
+        task_settings: The task.
+        jobs: Processes.
+        on_shard: Called with the number of shards that are finished.
+
+    Returns:
+        All samples, in an order that does not depend on the processes.
+
+    Raises:
+        ValueError: The folder holds data of other settings.
+    """
+    import joblib
+
+    task_settings = task_settings or task.CartPoleSettings()
+    folder.mkdir(parents=True, exist_ok=True)
+    _claim(folder, metric, settings, task_settings)
+    paths = [folder / f"shard_{index:04d}.npz" for index in range(settings.shards)]
+    missing = [index for index, path in enumerate(paths) if not path.exists()]
+    done = settings.shards - len(missing)
+    if on_shard is not None:
+        on_shard(done)
+    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
+    calls = (
+        joblib.delayed(_write_shard)(paths[index], index, metric, settings, task_settings)
+        for index in missing
+    )
+    for _ in parallel(calls):
+        done += 1
+        if on_shard is not None:
+            on_shard(done)
+    return _gather(paths)
+
+
+def make_shard(
+    index: int, metric: Metric, settings: ExpertDataSettings, task_settings: task.CartPoleSettings
+) -> dict[str, Any]:
+    """Generate one shard: plan, fill the tubes, keep the verified region, label."""
+    expert = CartPoleExpert(metric, task_settings)
+    count = settings.plans // settings.shards
+    seeds = episode_seeds(settings.seed, settings.plans)[index * count : (index + 1) * count]
+    plans = []
+    for seed in seeds:
+        scenario = task.sample_scenario(episode_streams(seed).scenario, task_settings)
+        plan = expert.planner.plan(scenario.initial_state, scenario.goal)
+        # A plan that does not hold is no target; the share is reported with the data.
+        if plan.solved:
+            plans.append(plan)
+    states = np.stack([plan.states for plan in plans])
+    controls = np.stack([plan.controls for plan in plans])
+    rng = np.random.default_rng([settings.seed, index])
+    wanted = settings.samples // settings.shards
+    parts: list[tuple[FloatArray, FloatArray, IntArray]] = []
+    kept = drawn = 0
+    while kept < wanted:
+        points, plan_of, step = tube_states(rng, expert, states, controls, settings)
+        choice = rng.permutation(len(points))
+        points, plan_of, step = points[choice], plan_of[choice], step[choice]
+        nominal, nominal_control = states[plan_of, step], controls[plan_of, step]
+        inside = metric.region.contains(points, nominal, nominal_control)
+        # Count only the states that were needed: the last batch is cut.
+        needed = int(np.searchsorted(np.cumsum(inside), wanted - kept)) + 1
+        points, plan_of, step = points[:needed], plan_of[:needed], step[:needed]
+        inside, drawn = inside[:needed], drawn + len(points)
+        points, plan_of, step = points[inside], plan_of[inside], step[inside]
+        label = expert.control(points, states[plan_of, step], controls[plan_of, step])
+        parts.append((observations(points, states[plan_of], step, task_settings), label, plan_of))
+        kept += len(points)
+    observation, control, plan_of = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return {
+        "observation": observation,
+        "control": control,
+        "plan": plan_of,
+        "plan_states": states,
+        "plan_controls": controls,
+        "drawn": np.array(drawn),
+    }
+
+
+def tube_states(
+    rng: np.random.Generator,
+    expert: CartPoleExpert,
+    states: FloatArray,
+    controls: FloatArray,
+    settings: ExpertDataSettings,
+) -> tuple[FloatArray, IntArray, IntArray]:
+    """Fill the tube around each plan: u* in closed loop under random disturbances (Theorem 4).
+
+    Each plan is flown once, under a kind and a bound of its own; a ball the size of one more step
+    of disturbance surrounds every state that is met.
+
+    Args:
+        rng: Random generator.
+        expert: The law u*.
+        states: x_d, shape (p, N + 1, 4).
+        controls: u_d, shape (p, N, 1).
+        settings: What to generate.
+
+    Returns:
+        States (p N, 4), the plan and the step of each.
+    """
+    plans, steps = controls.shape[:2]
+    period = expert.task.control_period
+    # Every bound down to zero: the tube of a small disturbance lies inside that of a large one.
+    bound = settings.disturbance_bound * rng.random(plans)
+    pushes = np.stack(
+        [
+            OPEN_LOOP[_KINDS[rng.integers(len(_KINDS))]](rng, steps, states.shape[-1], period)
+            for _ in range(plans)
+        ]
+    )
+    pushes *= bound[:, None, None]
+    state = states[:, 0]
+    met = np.empty((plans, steps, states.shape[-1]))
+    for step in range(steps):
+        met[:, step] = state
+        control = expert.control(state, states[:, step], controls[:, step])
+        state = hold_step(expert.task.system, state, control, period, pushes[:, step])
+    spread = settings.spread * settings.disturbance_bound * period
+    noise = into_unit_ball(rng.standard_normal(met.shape)) * rng.random((plans, steps, 1))
+    # The start is known exactly; the tube has radius zero there.
+    noise[:, 0] = 0.0
+    met += spread * noise
+    finite = np.all(np.isfinite(met), axis=-1)
+    plan_of, step_of = np.nonzero(finite)
+    return met[finite], plan_of, step_of
+
+
+def _write_shard(
+    path: Path,
+    index: int,
+    metric: Metric,
+    settings: ExpertDataSettings,
+    task_settings: task.CartPoleSettings,
+) -> None:
+    shard = make_shard(index, metric, settings, task_settings)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".tmp")
+    with os.fdopen(handle, "wb") as file:
+        np.savez(file, **shard)
+    os.replace(temporary, path)
+
+
+def _gather(paths: list[Path]) -> ExpertData:
+    shards = []
+    for path in paths:
+        with np.load(path, allow_pickle=False) as file:
+            shards.append({name: file[name] for name in file.files})
+    offsets = np.cumsum([0] + [len(shard["plan_states"]) for shard in shards[:-1]])
+    for shard, offset in zip(shards, offsets, strict=True):
+        shard["plan"] = shard["plan"] + offset
+    joined = {
+        name: np.concatenate([shard[name] for shard in shards])
+        for name in ("observation", "control", "plan", "plan_states", "plan_controls")
+    }
+    return ExpertData(**joined, drawn=int(sum(int(shard["drawn"]) for shard in shards)))
+
+
+def _claim(
+    folder: Path,
+    metric: Metric,
+    settings: ExpertDataSettings,
+    task_settings: task.CartPoleSettings,
+) -> None:
+    """Refuse to mix shards of different settings in one folder."""
+    digest = hashlib.sha256(metric.coefficients.tobytes()).hexdigest()
+    record = json.loads(
+        json.dumps({"data": asdict(settings), "task": asdict(task_settings), "metric": digest})
+    )
+    manifest = folder / "manifest.json"
+    if manifest.exists():
+        if json.loads(manifest.read_text()) != record:
+            raise ValueError(
+                f"{folder} holds expert data of other settings; name another folder or remove it"
+            )
+        return
+    temporary = manifest.with_suffix(".tmp")
+    temporary.write_text(json.dumps(record, indent=1))
+    os.replace(temporary, manifest)

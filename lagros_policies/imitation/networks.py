@@ -1,0 +1,160 @@
+"""Multilayer perceptrons that run without torch, stored as safetensors."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32Array = NDArray[np.float32]
+
+_FORMAT = "lagros-mlp-1"
+
+
+class Mlp:
+    """A fully connected network with tanh between its layers, evaluated in NumPy float32.
+
+    Normalisation of inputs and outputs is folded into the first and last layer, so that one call
+    is the layers and nothing else.
+
+    Args:
+        weights: One matrix (inputs, outputs) per layer.
+        biases: One vector (outputs,) per layer.
+        metadata: Strings that describe the network; stored beside the weights.
+
+    Raises:
+        ValueError: The shapes do not chain, or a number is not finite.
+    """
+
+    def __init__(
+        self,
+        weights: Sequence[NDArray[np.floating]],
+        biases: Sequence[NDArray[np.floating]],
+        metadata: dict[str, str] | None = None,
+    ) -> None:
+        """Copy the layers to float32 and allocate the buffers of a single evaluation."""
+        if not weights or len(weights) != len(biases):
+            raise ValueError(f"{len(weights)} weight matrices need as many biases")
+        self.weights = [np.ascontiguousarray(weight, np.float32) for weight in weights]
+        self.biases = [np.ascontiguousarray(bias, np.float32) for bias in biases]
+        self.metadata = dict(metadata or {})
+        width = self.weights[0].shape[0] if self.weights[0].ndim == 2 else -1
+        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            if weight.ndim != 2 or weight.shape[0] != width or bias.shape != weight.shape[1:]:
+                raise ValueError(
+                    f"layer {index} has weights {weight.shape} and biases {bias.shape}, "
+                    f"which do not follow a layer of width {width}"
+                )
+            if not (np.all(np.isfinite(weight)) and np.all(np.isfinite(bias))):
+                raise ValueError(f"layer {index} holds numbers that are not finite")
+            width = weight.shape[1]
+        self._buffers = [np.empty(bias.shape, np.float32) for bias in self.biases]
+        self._hidden = list(zip(self.weights, self.biases, self._buffers, strict=True))[:-1]
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs."""
+        return int(self.weights[0].shape[0])
+
+    @property
+    def outputs(self) -> int:
+        """Number of outputs."""
+        return int(self.weights[-1].shape[1])
+
+    def __call__(self, features: Float32Array) -> Float32Array:
+        """Evaluate the network.
+
+        Args:
+            features: Shape (inputs,) or (batch, inputs), float32.
+
+        Returns:
+            Shape (outputs,) or (batch, outputs). For a single evaluation it is a buffer that the
+            next one overwrites.
+        """
+        if features.ndim == 1:
+            return self._single(features)
+        layer: Float32Array = features
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            layer = np.tanh(layer @ weight + bias)
+        return layer @ self.weights[-1] + self.biases[-1]
+
+    def _single(self, features: Float32Array) -> Float32Array:
+        layer = features
+        for weight, bias, buffer in self._hidden:
+            np.dot(layer, weight, out=buffer)
+            np.add(buffer, bias, out=buffer)
+            np.tanh(buffer, out=buffer)
+            layer = buffer
+        last = self._buffers[-1]
+        np.dot(layer, self.weights[-1], out=last)
+        np.add(last, self.biases[-1], out=last)
+        return last
+
+    def save(self, path: Path | str) -> None:
+        """Write weights and metadata as safetensors, atomically."""
+        tensors: dict[str, Float32Array] = {}
+        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            tensors[f"layer{index}.weight"] = weight
+            tensors[f"layer{index}.bias"] = bias
+        write_safetensors(path, tensors, {**self.metadata, "format": _FORMAT, "activation": "tanh"})
+
+    @classmethod
+    def load(cls, path: Path | str) -> Mlp:
+        """Read a network.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file is damaged or not such a network.
+        """
+        tensors, metadata = read_safetensors(path)
+        if metadata.get("format") != _FORMAT or metadata.get("activation") != "tanh":
+            raise ValueError(
+                f"{path} is not a network of this package: its metadata say {metadata!r}"
+            )
+        count = len(tensors) // 2
+        try:
+            weights = [tensors[f"layer{index}.weight"] for index in range(count)]
+            biases = [tensors[f"layer{index}.bias"] for index in range(count)]
+        except KeyError as error:
+            raise ValueError(f"{path} lacks the tensor {error}") from error
+        return cls(weights, biases, metadata)
+
+
+def write_safetensors(
+    path: Path | str, tensors: dict[str, Float32Array], metadata: dict[str, str]
+) -> None:
+    """Write tensors and metadata to a temporary file and rename it."""
+    from safetensors.numpy import save
+
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".tmp")
+    with os.fdopen(handle, "wb") as file:
+        file.write(save(tensors, metadata))
+    os.replace(temporary, path)
+
+
+def read_safetensors(path: Path | str) -> tuple[dict[str, Float32Array], dict[str, str]]:
+    """Read tensors and metadata; nothing in such a file is executed.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is truncated or not safetensors.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no weight file {path}")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = dict(file.metadata() or {})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError) as error:
+        raise ValueError(
+            f"{path} is damaged or not a safetensors file ({error}); fetch or train it again"
+        ) from error
+    return tensors, metadata

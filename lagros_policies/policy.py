@@ -1,0 +1,97 @@
+"""What a policy is, and the names under which the policies are built."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.cartpole_task import CartPoleSettings
+
+Float32Array = NDArray[np.float32]
+# What a planner remembers between calls; stateless policies keep None.
+PolicyState = Any
+
+NAMES = ("learned", "tube-mpc", "lagros", "lqr", "random", "ppo")
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Stable-baselines3's `PolicyPredictor`, with a name and what it may observe."""
+
+    name: str
+    observes: Literal["local", "global"]
+
+    def predict(
+        self,
+        observation: Float32Array,
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, PolicyState]:
+        """Choose an action.
+
+        Args:
+            observation: Flat observation (o,), or a batch of them (B, o).
+            state: What the last call returned; None at the start of an episode.
+            episode_start: Which rows of a batch start an episode, shape (B,).
+            deterministic: Whether to suppress the policy's own randomness.
+
+        Returns:
+            The action (m,) or (B, m), float32 in the units of the environment, and the state.
+        """
+
+
+def make(name: str, env: gym.Env[Any, Any], **settings: Any) -> Policy:
+    """Build a policy for an environment.
+
+    Args:
+        name: One of `NAMES`, or the path of a stable-baselines3 model (a zip file). Such a file
+            holds pickled code: loading it runs it, so load only what you trust.
+        env: The environment; the policy takes its task settings and nothing else.
+        settings: Passed to the policy, e.g. `weights=path` or `metric=...`.
+
+    Returns:
+        The policy.
+
+    Raises:
+        ValueError: The name is unknown.
+        TypeError: The environment is not one of this package.
+    """
+    task = getattr(env.unwrapped, "settings", None)
+    if not isinstance(task, CartPoleSettings):
+        raise TypeError(f"there are no policies for {env}; use an environment of lagros_envs")
+    if name in NAMES:
+        return _builders()[name](task, **settings)
+    if name.endswith(".zip") or ":" in name:
+        from lagros_policies.baselines import load_stable_baselines3
+
+        algorithm, _, path = name.rpartition(":")
+        return load_stable_baselines3(path, algorithm or None, **settings)
+    near = difflib.get_close_matches(name, NAMES, n=1)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    raise ValueError(
+        f"policy {name!r} is not known.{hint} Use one of {', '.join(NAMES)}, or the path of a "
+        "stable-baselines3 zip"
+    )
+
+
+def _builders() -> dict[str, Callable[..., Policy]]:
+    # Imported late: torch, solvers and learned weights are needed only by whoever asks for them.
+    from lagros_policies.baselines import LqrPolicy, PpoPolicy, RandomPolicy
+    from lagros_policies.lagros import LagrosPolicy
+    from lagros_policies.learned import LearnedPolicy
+    from lagros_policies.tube_mpc import TubeMpcPolicy
+
+    return {
+        "learned": LearnedPolicy,
+        "tube-mpc": TubeMpcPolicy,
+        "lagros": LagrosPolicy,
+        "lqr": LqrPolicy,
+        "random": RandomPolicy,
+        "ppo": PpoPolicy,
+    }
