@@ -38,7 +38,7 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     | 12    | `time`          | t [s]                                              |
 
     ## Dynamics
-    dx/dt = f(x) + B(x) u + d, Runge-Kutta in two substeps, u and d held over the control step,
+    dx/dt = f(x) + B(x) u + d, Runge-Kutta in four substeps, u and d held over the control step,
     ||d|| <= `disturbance_bound`.
 
     ## Reward
@@ -95,7 +95,9 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             disturbance, disturbance_bound, channel_mask(disturbance_channels, task.RATES), metric
         )
         self.named_space = task.named_space(self.settings)
-        self.observation_space = cast("spaces.Space[NDArray[np.float32]]", spaces.flatten_space(self.named_space))
+        self.observation_space = cast(
+            "spaces.Space[NDArray[np.float32]]", spaces.flatten_space(self.named_space)
+        )
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
         self.render_mode = render_mode
         self._renderer: Any = None

@@ -46,18 +46,37 @@ class Situation:
 Feedback = Callable[[Situation], FloatArray]
 
 
+def _rays(vectors: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return largest entry, vector over it and norm of that, which can neither over- nor underflow.
+
+    Args:
+        vectors: Shape (..., n).
+
+    Returns:
+        Shapes (..., 1), (..., n) and (..., 1); ones in place of the norm of a zero vector.
+    """
+    largest = np.max(np.abs(vectors), axis=-1, keepdims=True)
+    rays: FloatArray = vectors / np.where(largest > 0.0, largest, 1.0)
+    lengths = np.linalg.norm(rays, axis=-1, keepdims=True)
+    return largest, rays, np.maximum(lengths, 1.0)
+
+
+def into_ball(vectors: FloatArray, radius: float) -> FloatArray:
+    """Shorten the vectors (..., n) that are longer than the radius to the radius."""
+    largest, rays, lengths = _rays(vectors)
+    limit = (_INSIDE * radius) / lengths
+    return np.where(largest <= limit, vectors, rays * limit)
+
+
 def into_unit_ball(vectors: FloatArray) -> FloatArray:
     """Shorten the vectors (..., n) that are longer than one to length one."""
-    norms = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    shortened: FloatArray = vectors * (_INSIDE / np.maximum(norms, _INSIDE))
-    return shortened
+    return into_ball(vectors, 1.0)
 
 
 def onto_unit_sphere(vectors: FloatArray, fallback: FloatArray) -> FloatArray:
     """Scale the vectors (..., n) to length one; where one is zero take the fallback."""
-    norms = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    safe = np.where(norms > 0.0, norms, 1.0)
-    return np.where(norms > 0.0, vectors * (_INSIDE / safe), fallback)
+    largest, rays, lengths = _rays(vectors)
+    return np.where(largest > 0.0, rays * (_INSIDE / lengths), fallback)
 
 
 def _directions(rng: np.random.Generator, count: int, channels: int) -> FloatArray:
@@ -223,12 +242,10 @@ class Disturbance:
                 f"{bool(np.all(np.isfinite(push)))}); it must return finite values of the state's "
                 f"shape {situation.state.shape}"
             )
-        push = push * np.asarray(self.channels)
+        pass
         if self.kind == "worst":
             return self.bound * onto_unit_sphere(push, situation.direction)
-        if self.bound == 0.0:
-            return np.zeros_like(push)
-        return self.bound * into_unit_ball(push / self.bound)
+        return into_ball(push, self.bound)
 
 
 def channel_mask(

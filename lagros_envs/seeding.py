@@ -10,6 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+# Namespace of the episodes that a policy is judged on ("eval" in ASCII). Training draws from the
+# empty namespace, so that no evaluation meets a training scenario, whatever the two seeds are.
+EVALUATION = 0x6576616C
+
 
 class Streams(NamedTuple):
     """Random generators of one episode."""
@@ -38,15 +42,19 @@ def episode_streams(seed: int) -> Streams:
     )
 
 
-def episode_seeds(seed: int, count: int) -> list[int]:
+def episode_seeds(seed: int, count: int, namespace: int | None = None) -> list[int]:
     """Return seeds of `count` episodes that belong to one run; a longer run begins with a shorter.
 
     Args:
         seed: Seed of the run.
         count: Number of episodes.
+        namespace: Separates runs of one seed that must not share episodes: `EVALUATION`, or None
+            for training.
 
     Returns:
-        Integers below 2**63, statistically independent of those of any other run.
+        Integers below 2**63, statistically independent of those of any other run or namespace.
     """
-    words = np.random.SeedSequence(seed).generate_state(count, np.uint64)
+    # A spawn key, not further entropy: SeedSequence((s, n)) is SeedSequence(s + n * 2**32).
+    spawn_key = () if namespace is None else (namespace,)
+    words = np.random.SeedSequence(seed, spawn_key=spawn_key).generate_state(count, np.uint64)
     return [int(word >> np.uint64(1)) for word in words]

@@ -267,9 +267,10 @@ def _gather(paths: list[Path]) -> ExpertData:
     for path in paths:
         with np.load(path, allow_pickle=False) as file:
             shards.append({name: file[name] for name in file.files})
-    offsets = np.cumsum([0] + [len(shard["plan_states"]) for shard in shards[:-1]])
-    for shard, offset in zip(shards, offsets, strict=True):
+    offset = 0
+    for shard in shards:
         shard["plan"] = shard["plan"] + offset
+        offset += len(shard["plan_states"])
     joined = {
         name: np.concatenate([shard[name] for shard in shards])
         for name in ("observation", "control", "plan", "plan_states", "plan_controls")

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import System, hold_step
-
 FloatArray = NDArray[np.float64]
 
 
@@ -43,10 +41,3 @@ class Trajectory:
     def effort(self) -> float:
         """The integral of ||u_d||^2 over the plan."""
         return float(np.sum(self.controls**2) * self.period)
-
-
-def dynamics_defects(
-    system: System, states: FloatArray, controls: FloatArray, period: float
-) -> FloatArray:
-    """Return F(x_k, u_k) - x_{k+1} of the true Runge-Kutta dynamics, shape (N, n)."""
-    return hold_step(system, states[:-1], controls, period) - states[1:]

@@ -1,0 +1,68 @@
+"""A policy that is one evaluation of a network: the common body of (a) and (c)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs import cartpole_task as task
+from lagros_policies.imitation.features import FEATURES, cartpole_features
+from lagros_policies.imitation.networks import Mlp
+from lagros_policies.policy import PolicyState
+
+Float32Array = NDArray[np.float32]
+PRETRAINED = Path(__file__).parents[1] / "pretrained"
+
+
+class NetworkPolicy:
+    """Maps (x, o_l, t) to a force by one evaluation of a network, without torch.
+
+    Args:
+        settings: The task; it fixes the unit of the action.
+        weights: A safetensors file written by `Mlp.save`; the shipped one if left out.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is damaged, or its network has other inputs.
+    """
+
+    name: ClassVar[str]
+    weights_file: ClassVar[str]
+    observes: Literal["local", "global"] = "local"
+
+    def __init__(
+        self, settings: task.CartPoleSettings | None = None, weights: Path | str | None = None
+    ) -> None:
+        """Load the network."""
+        self.settings = settings or task.CartPoleSettings()
+        path = PRETRAINED / self.weights_file if weights is None else Path(weights)
+        self.network = Mlp.load(path)
+        if self.network.inputs != len(FEATURES) or self.network.outputs != 1:
+            raise ValueError(
+                f"{path} has {self.network.inputs} inputs and {self.network.outputs} outputs; "
+                f"a cart-pole network has {len(FEATURES)} and 1"
+            )
+        self._unit = np.float32(1.0 / self.settings.force_scale)
+
+    def predict(
+        self,
+        observation: Float32Array,
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, PolicyState]:
+        """Evaluate the network; see `Policy.predict`."""
+        features, side = cartpole_features(np.asarray(observation, np.float32))
+        force = self.network(features)
+        return force * (side[..., None] * self._unit), state
+
+    def bare_forward(self, features: Float32Array) -> Float32Array:
+        """Evaluate the network alone, for timing: features (7,) to force (1,) [N]."""
+        return self.network(features)
+
+    def example_features(self) -> Float32Array:
+        """Return typical features, shape (7,)."""
+        return np.array([-2.0, 0.5, 1.0, -0.5, 3.0, 0.8, 0.5], np.float32)

@@ -1,0 +1,14 @@
+"""Policy (c), LAG-ROS: a network that imitates the robust control u* (Theorem 1)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from lagros_policies.imitation.network_policy import NetworkPolicy
+
+
+class LagrosPolicy(NetworkPolicy):
+    """(x, o_l, t) -> u*: planner and tracking control in one evaluation."""
+
+    name: ClassVar[str] = "lagros"
+    weights_file: ClassVar[str] = "cartpole_lagros.safetensors"

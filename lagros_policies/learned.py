@@ -1,0 +1,14 @@
+"""Policy (a): a network that imitates the planner's control u_d, without feedback of the error."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from lagros_policies.imitation.network_policy import NetworkPolicy
+
+
+class LearnedPolicy(NetworkPolicy):
+    """(x, o_l, t) -> u_d, trained on the target trajectories alone (Lemma 1)."""
+
+    name: ClassVar[str] = "learned"
+    weights_file: ClassVar[str] = "cartpole_learned.safetensors"

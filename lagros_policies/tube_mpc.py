@@ -1,0 +1,140 @@
+"""Policy (b): online tube MPC. Plan, re-plan while the horizon shrinks, track the plan with u*."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs import cartpole_task as task
+from lagros_policies.contraction import Metric
+from lagros_policies.expert import CartPoleExpert
+from lagros_policies.planning import Trajectory
+from lagros_policies.policy import PolicyState
+
+Float32Array = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+
+
+@dataclass
+class TubeMpcState:
+    """What the planner of one episode remembers.
+
+    Attributes:
+        plan: The plan in force; its last step is the time limit. None before the first succeeds.
+        goal: The goal it was made for.
+        plans: Plans asked for.
+        failed_plans: Plans that did not hold; the last one stayed in force.
+        late_plans: Plans that took longer than the deadline; the last one stayed in force.
+    """
+
+    plan: Trajectory | None = None
+    goal: FloatArray = field(default_factory=lambda: np.full(task.STATE_DIM, np.nan))
+    plans: int = 0
+    failed_plans: int = 0
+    late_plans: int = 0
+
+
+class TubeMpcPolicy:
+    """Online tube MPC with the CV-STEM control u* around the plan.
+
+    The plan is renewed from the *nominal* state x_d(t), not from the measured one: the tube of
+    Theorem 1 surrounds one continuous target trajectory, and u* deals with the error. A re-plan
+    follows a goal that moves; without one it confirms the plan. If a plan fails or comes late the
+    last one stays in force; before there is any, a late plan is used (the system waits) and a
+    failed one means no force for this step. All of it is counted.
+
+    Args:
+        settings: The task.
+        metric: The contraction metric; the shipped one if left out.
+        replan_every: Control steps between plans.
+        deadline: Delta t_max, after which a plan is late [s].
+        clock: Source of the time, for tests [s].
+
+    Raises:
+        ValueError: `replan_every` is less than one or the deadline is not positive.
+    """
+
+    name = "tube-mpc"
+    observes: Literal["local", "global"] = "local"
+
+    def __init__(
+        self,
+        settings: task.CartPoleSettings | None = None,
+        metric: Metric | None = None,
+        replan_every: int = 1,
+        deadline: float = 0.1,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        """Build planner and law."""
+        if replan_every < 1 or not deadline > 0.0:
+            raise ValueError(
+                f"replan_every={replan_every!r} must be >= 1 and deadline={deadline!r} > 0"
+            )
+        self.settings = settings or task.CartPoleSettings()
+        self.expert = CartPoleExpert(metric, self.settings)
+        self.replan_every = replan_every
+        self.deadline = deadline
+        self._clock = clock
+
+    def predict(
+        self,
+        observation: Float32Array,
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, PolicyState]:
+        """Plan if it is time, and track; see `Policy.predict`. The state is one per row."""
+        rows = np.atleast_2d(np.asarray(observation, np.float64))
+        memories: list[TubeMpcState | None] = [None] * len(rows) if state is None else list(state)
+        if len(memories) != len(rows):
+            raise ValueError(f"state remembers {len(memories)} episodes; {len(rows)} are observed")
+        starts = np.zeros(len(rows), bool) if episode_start is None else episode_start
+        fresh = [
+            TubeMpcState() if memory is None or start else memory
+            for memory, start in zip(memories, starts, strict=True)
+        ]
+        force = np.array(
+            [self._force(row, memory) for row, memory in zip(rows, fresh, strict=True)]
+        )
+        action = (force / self.settings.force_scale).astype(np.float32)
+        return (action if np.ndim(observation) == 2 else action[0]), fresh
+
+    def counters(self, state: PolicyState) -> dict[str, int]:
+        """Return how many plans were made, failed and were late, over the episodes of a state."""
+        names = ("plans", "failed_plans", "late_plans")
+        return {name: sum(getattr(memory, name) for memory in state) for name in names}
+
+    def _force(self, row: FloatArray, memory: TubeMpcState) -> FloatArray:
+        settings = self.settings
+        step = round(float(row[task.TIME]) / settings.control_period)
+        # Past the time limit the plan has ended: hold its last nominal state.
+        step = min(step, settings.steps - 1)
+        goal = row[task.GOAL]
+        moved = not np.array_equal(goal, memory.goal)
+        if memory.plan is None or moved or step % self.replan_every == 0:
+            self._renew(row, goal, step, memory)
+        plan = memory.plan
+        if plan is None:
+            return np.zeros(1)
+        index = step - (settings.steps - plan.horizon)
+        return self.expert.control(row[task.STATE], plan.states[index], plan.controls[index])
+
+    def _renew(self, row: FloatArray, goal: FloatArray, step: int, memory: TubeMpcState) -> None:
+        plan = memory.plan
+        if plan is None:
+            start = row[task.STATE] if step else row[task.INITIAL_STATE]
+        else:
+            start = plan.states[step - (self.settings.steps - plan.horizon)]
+        begun = self._clock()
+        renewed = self.expert.planner.plan(start, goal, step, plan)
+        late = self._clock() - begun > self.deadline
+        memory.plans += 1
+        memory.late_plans += late
+        memory.failed_plans += not renewed.solved
+        if renewed.solved and (plan is None or not late):
+            memory.plan, memory.goal = renewed, goal.copy()
