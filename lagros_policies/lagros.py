@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from lagros_policies.imitation.network_policy import NetworkPolicy
 
 
 class LagrosPolicy(NetworkPolicy):
     """(x, o_l, t) -> u*: planner and tracking control in one evaluation."""
 
-    name: ClassVar[str] = "lagros"
-    weights_file: ClassVar[str] = "cartpole_lagros.safetensors"
+    name = "lagros"
+    weights_file = "cartpole_lagros.safetensors"

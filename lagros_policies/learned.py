@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from lagros_policies.imitation.network_policy import NetworkPolicy
 
 
 class LearnedPolicy(NetworkPolicy):
     """(x, o_l, t) -> u_d, trained on the target trajectories alone (Lemma 1)."""
 
-    name: ClassVar[str] = "learned"
-    weights_file: ClassVar[str] = "cartpole_learned.safetensors"
+    name = "learned"
+    weights_file = "cartpole_learned.safetensors"

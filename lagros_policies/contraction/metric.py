@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
+from lagros_policies.files import write_atomic
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -193,12 +192,7 @@ def save_metric(metric: Metric, path: Path | str) -> None:
             name: getattr(metric.verification, name) for name in Verification.__dataclass_fields__
         },
     }
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".tmp")
-    with os.fdopen(handle, "w") as file:
-        json.dump(record, file, indent=1)
-    os.replace(temporary, path)
+    write_atomic(path, json.dumps(record, indent=1) + "\n")
 
 
 def load_metric(path: Path | str | None = None) -> Metric:

@@ -8,9 +8,8 @@ shard survives and the rest is made again, bit for bit.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
-import os
-import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,10 +24,13 @@ from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_policies.contraction import Metric
 from lagros_policies.expert import CartPoleExpert
+from lagros_policies.files import write_atomic
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
+# Give up where fewer than one state in so many is inside the verified region.
+_PATIENCE = 100
 # Kinds of disturbance whose closed loops fill the tube; `none` would only repeat the plan.
 _KINDS = ("uniform", "sphere", "constant", "sinusoid", "gust")
 
@@ -175,6 +177,11 @@ def make_shard(
     parts: list[tuple[FloatArray, FloatArray, IntArray]] = []
     kept = drawn = 0
     while kept < wanted:
+        if drawn > _PATIENCE * wanted:
+            raise ValueError(
+                f"only {kept} of {drawn} states lie in the verified region {metric.region}: "
+                "verify a larger region or lower disturbance_bound"
+            )
         points, plan_of, step = tube_states(rng, expert, states, controls, settings)
         choice = rng.permutation(len(points))
         points, plan_of, step = points[choice], plan_of[choice], step[choice]
@@ -224,14 +231,14 @@ def tube_states(
     plans, steps = controls.shape[:2]
     period = expert.task.control_period
     # Every bound down to zero: the tube of a small disturbance lies inside that of a large one.
-    bound = settings.disturbance_bound * rng.random(plans)
+    bound: FloatArray = settings.disturbance_bound * rng.random((plans, 1, 1))
     pushes = np.stack(
         [
             OPEN_LOOP[_KINDS[rng.integers(len(_KINDS))]](rng, steps, states.shape[-1], period)
             for _ in range(plans)
         ]
     )
-    pushes *= bound[:, None, None]
+    pushes *= bound
     state = states[:, 0]
     met = np.empty((plans, steps, states.shape[-1]))
     for step in range(steps):
@@ -256,10 +263,9 @@ def _write_shard(
     task_settings: task.CartPoleSettings,
 ) -> None:
     shard = make_shard(index, metric, settings, task_settings)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".tmp")
-    with os.fdopen(handle, "wb") as file:
-        np.savez(file, **shard)
-    os.replace(temporary, path)
+    buffer = io.BytesIO()
+    np.savez(buffer, **shard)
+    write_atomic(path, buffer.getvalue())
 
 
 def _gather(paths: list[Path]) -> ExpertData:
@@ -296,6 +302,4 @@ def _claim(
                 f"{folder} holds expert data of other settings; name another folder or remove it"
             )
         return
-    temporary = manifest.with_suffix(".tmp")
-    temporary.write_text(json.dumps(record, indent=1))
-    os.replace(temporary, manifest)
+    write_atomic(manifest, json.dumps(record, indent=1) + "\n")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,8 @@ class NetworkPolicy:
         ValueError: The file is damaged, or its network has other inputs.
     """
 
-    name: ClassVar[str]
-    weights_file: ClassVar[str]
+    name: str
+    weights_file: str
     observes: Literal["local", "global"] = "local"
 
     def __init__(

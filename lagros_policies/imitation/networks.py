@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lagros_policies.files import write_atomic
 
 Float32Array = NDArray[np.float32]
 
@@ -127,15 +127,10 @@ class Mlp:
 def write_safetensors(
     path: Path | str, tensors: dict[str, Float32Array], metadata: dict[str, str]
 ) -> None:
-    """Write tensors and metadata to a temporary file and rename it."""
+    """Write tensors and metadata, whole or not at all."""
     from safetensors.numpy import save
 
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".tmp")
-    with os.fdopen(handle, "wb") as file:
-        file.write(save(tensors, metadata))
-    os.replace(temporary, path)
+    write_atomic(path, save(tensors, metadata))
 
 
 def read_safetensors(path: Path | str) -> tuple[dict[str, Float32Array], dict[str, str]]:
