@@ -50,8 +50,9 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     `initial_state`, `goal` and `nominal` (x_d at every control instant, shape (91, 4)).
 
     ## Episode end
-    `terminated` when |theta| > pi/2 (a fall); `truncated` at 9 s. The episode goes on after
-    success: the paper counts the first entry, the strict measure looks at the end.
+    `terminated` when |theta| > pi/2 (a fall; so is a force too large to integrate, which leaves the
+    state as it was); `truncated` at 9 s. The episode goes on after success: the paper counts the
+    first entry, the strict measure looks at the end.
 
     ## Info
     `success` (the paper's: at some control instant so far ||x - x_f|| <= r(t)), `success_time` [s]
@@ -169,17 +170,12 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         force = self._force(action)
         settings = self.settings
         push = self._current_push()
-        self._state = tuple(
-            rk4_hold(
-                settings.system, self._state, (force,), push.tolist(), settings.control_period, math
-            )
-        )
+        integrated = self._advance(force, push)
         self._push = push
         self._step += 1
         effort = force * force * settings.control_period
         self._effort += effort
-        # A state that overflowed has fallen too: `not <=` also catches nan.
-        fallen = not abs(self._state[1]) <= task.FALL_ANGLE
+        fallen = not integrated or abs(self._state[1]) > task.FALL_ANGLE
         distance = task.goal_distance(self._state, self._goal, math.sqrt)
         first_success = self._note_success(distance, fallen)
         reward = float(task.reward(settings, effort, distance, first_success, fallen))
@@ -238,6 +234,21 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise ValueError(f"action={value!r} is not finite")
         force: float = task.applied_force(self.settings, value, _clip)
         return force
+
+    def _advance(self, force: float, push: FloatArray) -> bool:
+        """Move the state over one control step, and tell whether it could be integrated."""
+        settings = self.settings
+        try:
+            following = rk4_hold(
+                settings.system, self._state, (force,), push.tolist(), settings.control_period, math
+            )
+        except (OverflowError, ValueError):  # an infinity has no sine
+            return False
+        # `not <=` also catches nan.
+        if any(not abs(part) <= task.LARGEST_STATE for part in following):
+            return False
+        self._state = tuple(following)
+        return True
 
     def _current_push(self) -> FloatArray:
         # Past the time limit (a caller who ignored `truncated`) the last push stays.

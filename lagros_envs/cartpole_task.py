@@ -23,6 +23,8 @@ FloatArray = NDArray[np.float64]
 STATE_DIM = 4
 RATES = (False, False, True, True)
 FALL_ANGLE = math.pi / 2  # [rad]
+# Beyond this, in units of the state, the integration has diverged under an enormous force.
+LARGEST_STATE = 1e12
 # Where each named part of the observation lies.
 STATE = slice(0, 4)
 GOAL = slice(4, 8)
@@ -72,7 +74,7 @@ class CartPoleSettings:
         """Check the values."""
         for item in fields(self):
             value = getattr(self, item.name)
-            if isinstance(value, float) and not (math.isfinite(value) and value >= 0.0):
+            if isinstance(value, int | float) and not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{item.name}={value!r} must be finite and >= 0")
         for name in ("control_period", "time_limit", "force_scale"):
             if getattr(self, name) == 0.0:
@@ -161,7 +163,7 @@ def nominal_from_options(
     value = options.get("nominal")
     if value is None:
         return None
-    nominal = np.asarray(value, dtype=np.float64)
+    nominal = np.array(value, dtype=np.float64)
     wanted = (*batch, settings.steps + 1, STATE_DIM)
     if nominal.shape != wanted or not np.all(np.isfinite(nominal)):
         raise ValueError(

@@ -27,8 +27,9 @@ class CartPoleVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.flo
     Spaces, dynamics, reward and info are those of `CartPoleEnv`, with a leading axis of worlds.
     `reset(seed=...)` takes one integer, from which the worlds draw independent seeds, or a list
     with one seed per world, each of which starts the episode that `CartPoleEnv.reset(seed=...)`
-    starts. `reset(options=...)` takes `initial_state` (num_envs, 4), `goal` (num_envs, 4),
-    `nominal` (num_envs, steps + 1, 4) and `reset_mask` (num_envs,).
+    starts. `reset(options=...)` takes `initial_state` (num_envs, 4), `goal` (num_envs, 4) or
+    (num_envs,), `nominal` (num_envs, steps + 1, 4) and `reset_mask` (num_envs,); what the options
+    say of worlds outside the mask is not looked at.
 
     Args:
         num_envs: Number of worlds.
@@ -122,21 +123,28 @@ class CartPoleVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.flo
             ValueError: A seed list or an option has a wrong length, shape or value.
         """
         options = options or {}
-        super().reset(seed=seed if isinstance(seed, int) else None)
+        seeds = self._seeds(seed)
+        if seeds is not None:
+            # The episodes that autoreset starts are as reproducible as the first ones.
+            self.np_random = np.random.default_rng(seeds)
+        elif seed is not None:
+            super().reset(seed=int(cast(int, seed)))
         mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
             raise ValueError(f"options['reset_mask'] must be {self.num_envs} booleans")
         if not self._started and not mask.all():
             raise ValueError("the first reset must start every world; leave out reset_mask")
         nominal = task.nominal_from_options(options, self.settings, (self.num_envs,))
-        if nominal is not None or mask.all():
+        if mask.all() or self.nominal is None:
             self.nominal = nominal
+        elif nominal is not None:
+            self.nominal = np.where(mask[:, None, None], nominal, self.nominal)
         if self.disturbance.kind == "worst" and self.nominal is None:
             raise ValueError(
                 'disturbance="worst" needs the nominal trajectories: pass '
                 'reset(options={"nominal": array of shape (num_envs, steps + 1, 4)})'
             )
-        self._begin(mask, self._seeds(seed), options)
+        self._begin(mask, seeds, self._checked_shapes(options))
         self._started = True
         distance = self._goal_distance()
         self._note_success(distance, mask)
@@ -195,9 +203,26 @@ class CartPoleVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.flo
         if seed is None or isinstance(seed, int | np.integer):
             return None
         seeds = [int(value) for value in seed]
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"seed has {len(seeds)} entries for {self.num_envs} worlds")
+        if len(seeds) != self.num_envs or min(seeds) < 0:
+            raise ValueError(f"seed must be {self.num_envs} non-negative integers; it is {seed!r}")
         return seeds
+
+    def _checked_shapes(self, options: dict[str, Any]) -> dict[str, Any]:
+        """Return start and goal of the options as arrays with a leading axis of worlds."""
+        worlds = self.num_envs
+        shapes: dict[str, list[tuple[int, ...]]] = {
+            "initial_state": [(worlds, task.STATE_DIM)],
+            "goal": [(worlds, task.STATE_DIM), (worlds,)],
+        }
+        checked = {}
+        for name in shapes.keys() & options.keys():
+            checked[name] = np.asarray(options[name], np.float64)
+            if checked[name].shape not in shapes[name]:
+                wanted = " or ".join(map(str, shapes[name]))
+                raise ValueError(
+                    f"options[{name!r}] has shape {checked[name].shape}; it must be {wanted}"
+                )
+        return checked
 
     def _begin(self, mask: BoolArray, seeds: list[int] | None, options: dict[str, Any]) -> None:
         """Draw scenario and disturbance of the masked worlds and put them at their start."""
@@ -237,12 +262,17 @@ class CartPoleVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.flo
             push = self.disturbance.respond(
                 Situation(self._state, self._nominal_now(), self._time(), push)
             )
-        following = hold_step(settings.system, self._state, force, settings.control_period, push)
-        self._state = np.where(moving[:, None], following, self._state)
+        with np.errstate(over="ignore", invalid="ignore"):
+            following = hold_step(
+                settings.system, self._state, force, settings.control_period, push
+            )
+        # Comparing with nan gives False: a world that could not be integrated stays and has fallen.
+        integrated = np.all(np.abs(following) <= task.LARGEST_STATE, axis=1) | ~moving
+        self._state = np.where((moving & integrated)[:, None], following, self._state)
         self._push = np.where(moving[:, None], push, 0.0)
         self._effort += np.where(moving, force[:, 0] ** 2 * settings.control_period, 0.0)
         self._step += moving
-        self._fallen = ~(np.abs(self._state[:, 1]) <= task.FALL_ANGLE)
+        self._fallen = ~integrated | (np.abs(self._state[:, 1]) > task.FALL_ANGLE)
 
     def _restart_now(self, ended: BoolArray, info: dict[str, Any]) -> dict[str, Any]:
         final_observation = self._observation()

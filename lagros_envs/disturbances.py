@@ -242,7 +242,7 @@ class Disturbance:
                 f"{bool(np.all(np.isfinite(push)))}); it must return finite values of the state's "
                 f"shape {situation.state.shape}"
             )
-        pass
+        push = push * np.asarray(self.channels)
         if self.kind == "worst":
             return self.bound * onto_unit_sphere(push, situation.direction)
         return into_ball(push, self.bound)

@@ -14,7 +14,7 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -349,9 +349,7 @@ class StableBaselines3Policy:
 
 
 def load_stable_baselines3(
-    path: Path | str,
-    algorithm: str | None = None,
-    settings: task.CartPoleSettings | None = None,
+    path: Path | str, algorithm: str | None = None
 ) -> StableBaselines3Policy:
     """Load a model saved by stable-baselines3's `model.save(path)`.
 
@@ -362,8 +360,6 @@ def load_stable_baselines3(
     Args:
         path: The zip file.
         algorithm: One of `ALGORITHMS`, in any case; None to detect it.
-        settings: The task. Where its `force_scale` is not that of the training, the model's
-            actions mean other forces; nothing in the file says so, and nothing is rescaled.
 
     Returns:
         The policy, on the CPU, named after the file.
@@ -422,11 +418,11 @@ def detect_algorithm(path: Path | str) -> str:
             f"({error})"
         ) from error
     if not isinstance(data, dict):
-        _ask(path)
+        raise _unclear(path)
     kind = data.get("policy_class")
     module = kind.get("__module__", "") if isinstance(kind, dict) else ""
     if not str(module).startswith("stable_baselines3."):
-        _ask(path)  # of sb3_contrib, or a policy class of the user's own
+        raise _unclear(path)  # of sb3_contrib, or a policy class of the user's own
     if "target_policy_noise" in data:
         plain = data.get("policy_delay") == 1 and data.get("target_noise_clip") == 0.0
         return "DDPG" if plain else "TD3"
@@ -436,11 +432,11 @@ def detect_algorithm(path: Path | str) -> str:
         return "PPO"
     if "gae_lambda" in data and "normalize_advantage" in data:
         return "A2C"
-    _ask(path)
+    raise _unclear(path)
 
 
-def _ask(path: Path | str) -> NoReturn:
-    raise ValueError(
+def _unclear(path: Path | str) -> ValueError:
+    return ValueError(
         f"{path} does not tell which algorithm it is of; say so with a prefix, e.g. ppo:{path} "
         f"(one of {_known()})"
     )

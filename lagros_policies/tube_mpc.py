@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
-from lagros_policies.contraction import Metric
+from lagros_policies.contraction import Metric, load_metric
 from lagros_policies.expert import CartPoleExpert
 from lagros_policies.planning import Trajectory
 from lagros_policies.policy import PolicyState
@@ -50,7 +51,7 @@ class TubeMpcPolicy:
 
     Args:
         settings: The task.
-        metric: The contraction metric; the shipped one if left out.
+        metric: The contraction metric, or its file; the shipped one if left out.
         replan_every: Control steps between plans.
         deadline: Delta t_max, after which a plan is late [s].
         clock: Source of the time, for tests [s].
@@ -65,7 +66,7 @@ class TubeMpcPolicy:
     def __init__(
         self,
         settings: task.CartPoleSettings | None = None,
-        metric: Metric | None = None,
+        metric: Metric | str | Path | None = None,
         replan_every: int = 1,
         deadline: float = 0.1,
         clock: Callable[[], float] = time.perf_counter,
@@ -76,7 +77,8 @@ class TubeMpcPolicy:
                 f"replan_every={replan_every!r} must be >= 1 and deadline={deadline!r} > 0"
             )
         self.settings = settings or task.CartPoleSettings()
-        self.expert = CartPoleExpert(metric, self.settings)
+        loaded = metric if isinstance(metric, Metric) else load_metric(metric)
+        self.expert = CartPoleExpert(loaded, self.settings)
         self.replan_every = replan_every
         self.deadline = deadline
         self._clock = clock

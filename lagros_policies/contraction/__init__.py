@@ -7,6 +7,7 @@ from lagros_policies.contraction.cvstem import (
     Samples,
     contraction_residual,
     design_metric,
+    design_on_pool,
     search_rate,
     verify_metric,
 )
@@ -31,6 +32,7 @@ __all__ = [
     "certified_tube",
     "contraction_residual",
     "design_metric",
+    "design_on_pool",
     "diverging_bound",
     "load_metric",
     "robust_control",

@@ -36,6 +36,7 @@ FloatArray = NDArray[np.float64]
 
 # Angles at which I <= W_bar(theta) <= chi I is imposed.
 _BOUND_ANGLES = 25
+_CHECK_ANGLES = 1001
 
 
 class InfeasibleError(ValueError):
@@ -131,11 +132,23 @@ def design_metric(
     scaled = np.einsum(
         "ij,jkl->ikl", values[:-2].reshape(settings.degree + 1, -1), problem.symmetric
     )
+    # Between the angles at which the bounds were imposed they hold but for a little: chi is what a
+    # finer grid shows, with W_bar and nu scaled so that the least eigenvalue there is one.
+    angles = np.linspace(0.0, region.angle, _CHECK_ANGLES)
+    eigenvalues = np.linalg.eigvalsh(
+        np.einsum("ai,ijk->ajk", basis(angles, settings.degree), scaled)
+    )
+    least = float(eigenvalues.min())
+    if least <= 0.0:
+        raise RuntimeError(
+            f"CV-STEM gave a W_bar that is not positive between the angles of its grid (status "
+            f"{status}); try another degree or scaling"
+        )
     return Metric(
-        coefficients=scaled * scale[:, None] * scale[None, :],
+        coefficients=scaled * scale[:, None] * scale[None, :] / least,
         contraction_rate=settings.contraction_rate,
-        condition_bound=float(values[-1]),
-        control_weight=float(values[-2]),
+        condition_bound=float(eigenvalues.max()) / least,
+        control_weight=float(values[-2]) / least,
         scaling=np.asarray(settings.scaling),
         region=region,
     )

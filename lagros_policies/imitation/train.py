@@ -92,17 +92,15 @@ def learning_error(network: Mlp, features: Float32Array, labels: Float32Array) -
 def fit(
     features: Float32Array,
     labels: Float32Array,
-    weights: Float32Array,
     settings: TrainingSettings,
     checkpoint: Path,
     on_epoch: Callable[[int, float], None] | None = None,
 ) -> Mlp:
-    """Fit a network by Adam on the weighted mean of a robust error.
+    """Fit a network by Adam on the mean of ||u_L - u*||, the loss of the paper.
 
     Args:
         features: Inputs, shape (s, inputs).
         labels: Expert controls, shape (s, outputs).
-        weights: Weight of each sample, shape (s,).
         settings: How to fit.
         checkpoint: File that holds the progress; removed by nobody, resumed from if it fits.
         on_epoch: Called with the epochs done and the last epoch's loss.
@@ -116,7 +114,7 @@ def fit(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        run = _Run(features, labels, weights, settings, checkpoint)
+        run = _Run(features, labels, settings, checkpoint)
         while run.epoch < settings.epochs:
             loss = run.one_epoch()
             if run.epoch % settings.checkpoint_every == 0 or run.epoch == settings.epochs:
@@ -135,7 +133,6 @@ class _Run:
         self,
         features: Float32Array,
         labels: Float32Array,
-        weights: Float32Array,
         settings: TrainingSettings,
         checkpoint: Path,
     ) -> None:
@@ -147,7 +144,6 @@ class _Run:
         self.output_mean, self.output_scale = _statistics(labels)
         self.features = torch.from_numpy((features - self.input_mean) / self.input_scale)
         self.labels = torch.from_numpy((labels - self.output_mean) / self.output_scale)
-        self.weights = torch.from_numpy(weights / weights.mean())
         torch.manual_seed(settings.seed)
         widths = [features.shape[1], *settings.hidden, labels.shape[1]]
         layers: list[torch.nn.Module] = []
@@ -177,7 +173,7 @@ class _Run:
             error = self.model(self.features[batch]) - self.labels[batch]
             # The paper's loss is the norm of the error; smoothed at zero so that it has a gradient.
             size = torch.sqrt((error * error).sum(1) + 1e-6)
-            loss = (self.weights[batch] * size).mean()
+            loss = size.mean()
             self.optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             self.optimiser.step()

@@ -1,0 +1,40 @@
+"""Paired episodes, intervals, tables, figures and the command line `lagros`.
+
+`BenchmarkSettings` says what to run, `run_benchmark` runs it, `summarise` turns the episodes into
+the rows of the published tables. `lagros_benchmarks.cli` is the same from a terminal.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lagros_benchmarks.episodes import EpisodeRecord, run_episode
+    from lagros_benchmarks.records import summarise
+    from lagros_benchmarks.runner import BenchmarkRun, run_benchmark
+    from lagros_benchmarks.settings import BenchmarkSettings
+
+__all__ = [
+    "BenchmarkRun",
+    "BenchmarkSettings",
+    "EpisodeRecord",
+    "run_benchmark",
+    "run_episode",
+    "summarise",
+]
+
+_HOMES = {
+    "BenchmarkRun": "runner",
+    "BenchmarkSettings": "settings",
+    "EpisodeRecord": "episodes",
+    "run_benchmark": "runner",
+    "run_episode": "episodes",
+    "summarise": "records",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for, and only that: `lagros --help` must not wait for SciPy."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

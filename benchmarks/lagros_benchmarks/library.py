@@ -1,0 +1,131 @@
+"""What the benchmark asks of `lagros_policies`, and the one place where it asks.
+
+Everything is imported when it is called: the command line must start at once, and a worker process
+imports only what its chunk needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Environment = gym.Env[Any, Any]
+
+
+class SetupError(Exception):
+    """A run cannot begin: a policy, the planner or the metric cannot be built."""
+
+
+class Policy(Protocol):
+    """What an episode needs of a policy: `predict` of stable-baselines3's protocol.
+
+    A policy may also have `counters(state) -> dict[str, int]`, `reseed(generator)` for what it
+    draws itself and, to time its network alone, `bare_forward` and `example_features()`.
+    """
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Any, Any]:
+        """Return the action and the policy's state."""
+        ...
+
+
+class Plan(Protocol):
+    """A planned trajectory: `states` (N + 1, n), whether it is `solved`, and its `defect`."""
+
+    @property
+    def states(self) -> Any:
+        """x_d at every control instant, shape (N + 1, n)."""
+        ...
+
+    @property
+    def solved(self) -> bool:
+        """Whether the planner vouches for it."""
+        ...
+
+    @property
+    def defect(self) -> float:
+        """The largest violation of the dynamics, in units of the state."""
+        ...
+
+
+class Planner(Protocol):
+    """Plans an episode from its start to its goal."""
+
+    def plan(self, initial_state: Any, goal: Any) -> Plan:
+        """Return the plan."""
+        ...
+
+
+def make_policy(name: str, env: Environment, settings: Mapping[str, Any]) -> Policy:
+    """Build a policy from its name or file."""
+    import lagros_policies
+
+    policy: Policy = lagros_policies.make(name, env, **settings)
+    return policy
+
+
+def make_planner() -> Planner:
+    """Return the planner whose cold plans are the nominal trajectories x_d of the episodes."""
+    from lagros_policies.planning.cartpole import CartPolePlanner
+
+    planner: Planner = CartPolePlanner()
+    return planner
+
+
+def load_metric(path: str | None) -> Callable[[FloatArray], FloatArray]:
+    """Return M(x), states (..., n) to (..., n, n), of the shipped metric or of a file."""
+    from lagros_policies.contraction import load_metric as load
+
+    matrix: Callable[[FloatArray], FloatArray] = load(path).matrix
+    return matrix
+
+
+def certified_radius(path: str | None, bound: float, times: FloatArray) -> FloatArray:
+    """Return the radius of our own certified tube at the times [s].
+
+    It is the tube of u* itself: a learning error would only widen it, and all policies are held
+    against the same one.
+
+    Args:
+        path: File of the metric, or None for the shipped one.
+        bound: d_bar, in units of the state per second.
+        times: Times [s].
+
+    Returns:
+        The radius at each time.
+    """
+    from lagros_policies.contraction import certified_tube
+    from lagros_policies.contraction import load_metric as load
+
+    tube = certified_tube(load(path), bound)
+    return np.asarray(tube.radius(times), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Toolbox:
+    """The functions above, in one value that travels to the workers and that a test can replace.
+
+    Attributes:
+        make_policy: Name, environment and settings to a policy.
+        make_planner: The planner of the nominal trajectories.
+        load_metric: File or None to M(x).
+        certified_radius: Metric file, bound and times to radii, or None without certificate.
+    """
+
+    make_policy: Callable[[str, Environment, Mapping[str, Any]], Policy] = make_policy
+    make_planner: Callable[[], Planner] = make_planner
+    load_metric: Callable[[str | None], Callable[[FloatArray], FloatArray]] = load_metric
+    certified_radius: Callable[[str | None, float, FloatArray], FloatArray | None] = (
+        certified_radius
+    )

@@ -1,0 +1,172 @@
+"""Our vector environments as stable-baselines3 `VecEnv`s: one array operation for all worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+Indices = int | Iterable[int] | None
+
+
+class SB3VectorEnv(VecEnv):
+    """A Gymnasium vector environment in same-step autoreset mode, as stable-baselines3 wants it.
+
+    Where an episode ends, the info of that world holds what stable-baselines3 reads there:
+    `terminal_observation` (the last observation of the episode; the one returned already belongs
+    to the next), `TimeLimit.truncated` (it ended by the time limit alone, so that the value beyond
+    it is bootstrapped), `episode` (`r` return, `l` length), and the final entries of our own info.
+    The infos of the other worlds are empty.
+
+    Args:
+        venv: The environment, with `autoreset_mode="same_step"` and flat Box spaces.
+
+    Raises:
+        ValueError: The environment resets in another mode.
+    """
+
+    def __init__(self, venv: gym.vector.VectorEnv[Any, Any, Any]) -> None:
+        """Wrap the environment; see the class."""
+        mode = venv.metadata.get("autoreset_mode")
+        if mode is not AutoresetMode.SAME_STEP:
+            raise ValueError(
+                f"autoreset_mode is {mode}; stable-baselines3 needs a vector environment built "
+                'with autoreset_mode="same_step"'
+            )
+        self.venv = venv
+        super().__init__(venv.num_envs, venv.single_observation_space, venv.single_action_space)
+        self._seed: int | None = None
+        self._actions: NDArray[Any] | None = None
+        self._returns = np.zeros(self.num_envs)
+        self._lengths = np.zeros(self.num_envs, dtype=np.intp)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Set the seed of the next reset; the worlds draw independent seeds from it.
+
+        Args:
+            seed: Non-negative integer, or None for a random one.
+
+        Returns:
+            The seed once per world; each world's own is drawn from it at the reset.
+        """
+        self._seed = seed
+        return [seed] * self.num_envs
+
+    def reset(self) -> NDArray[np.float32]:
+        """Start an episode in every world and return the observations (worlds, n)."""
+        observation, _ = self.venv.reset(seed=self._seed)
+        self._seed = None
+        self._returns[:] = 0.0
+        self._lengths[:] = 0
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        return np.asarray(observation)
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Store the actions (worlds, m) of the coming step."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Take the step: observations, rewards, dones and one info per world.
+
+        Raises:
+            RuntimeError: `step_async` was not called before.
+        """
+        if self._actions is None:
+            raise RuntimeError("call step_async() before step_wait()")
+        observation, reward, terminated, truncated, info = self.venv.step(self._actions)
+        self._actions = None
+        self._returns += reward
+        self._lengths += 1
+        done = terminated | truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for world in np.flatnonzero(done):
+            final = info["final_info"]
+            infos[world] = {key: values[world] for key, values in final.items()}
+            infos[world]["terminal_observation"] = info["final_obs"][world]
+            # A fall at the very last step is a fall: nothing is bootstrapped.
+            infos[world]["TimeLimit.truncated"] = bool(truncated[world] and not terminated[world])
+            infos[world]["episode"] = {
+                "r": float(self._returns[world]),
+                "l": int(self._lengths[world]),
+            }
+        self._returns[done] = 0.0
+        self._lengths[done] = 0
+        return observation, np.asarray(reward, dtype=np.float32), done, infos
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.venv.close()
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """Return the attribute of the environment, once per chosen world."""
+        value = getattr(self.venv, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Set the attribute for all worlds; they share one environment.
+
+        Raises:
+            ValueError: Only some worlds were chosen.
+        """
+        if len(list(self._get_indices(indices))) != self.num_envs:
+            raise ValueError(f"the worlds share {attr_name!r}: it can be set for all of them only")
+        setattr(self.venv, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of the environment once and return its value per chosen world."""
+        value = getattr(self.venv, method_name)(*method_args, **method_kwargs)
+        return [value for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Indices = None
+    ) -> list[bool]:
+        """Return False per chosen world, or True for Monitor, whose `episode` entry is provided."""
+        from stable_baselines3.common.monitor import Monitor
+
+        return [wrapper_class is Monitor for _ in self._get_indices(indices)]
+
+
+class LinearFeatures(VecEnvWrapper):
+    """Shows the agent fixed linear combinations of the observation.
+
+    Args:
+        venv: The environment, with flat observations of n numbers.
+        matrix: Features from observations, shape (k, n).
+
+    Raises:
+        ValueError: The matrix does not fit the observation.
+    """
+
+    def __init__(self, venv: VecEnv, matrix: NDArray[np.float64]) -> None:
+        """Wrap the environment; see the class."""
+        if matrix.ndim != 2 or (matrix.shape[1],) != venv.observation_space.shape:
+            raise ValueError(
+                f"matrix has shape {matrix.shape}; it must be (k, n) with n of the observation's "
+                f"shape {venv.observation_space.shape}"
+            )
+        space = spaces.Box(-np.inf, np.inf, (matrix.shape[0],), np.float32)
+        super().__init__(venv, observation_space=space)
+        self.matrix = matrix.astype(np.float32)
+
+    def reset(self) -> NDArray[np.float32]:
+        """Start an episode in every world and return the features (worlds, k)."""
+        features: NDArray[np.float32] = np.asarray(self.venv.reset()) @ self.matrix.T
+        return features
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Take the step and map the observations, those of ended episodes included."""
+        observation, reward, done, infos = self.venv.step_wait()
+        for world in np.flatnonzero(done):
+            infos[world]["terminal_observation"] = (
+                self.matrix @ infos[world]["terminal_observation"]
+            )
+        return np.asarray(observation) @ self.matrix.T, reward, done, infos

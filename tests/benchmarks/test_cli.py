@@ -1,0 +1,134 @@
+"""The command line: its errors, its files, its speed of starting."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+from typer.testing import CliRunner
+
+import lagros_policies
+from lagros_benchmarks import cli, library
+from lagros_envs.disturbances import KINDS
+from tests.benchmarks import fakes
+
+HEAVY = ("torch", "scipy", "matplotlib", "joblib", "cvxpy", "piqp", "gymnasium", "rich.progress")
+
+
+@pytest.fixture
+def invoke(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return lambda *arguments: CliRunner().invoke(cli.app, arguments)
+
+
+@pytest.fixture
+def faked(monkeypatch):
+    """The fakes in the place of the library, under its names."""
+    makers = {"lqr": "steady", "lagros": "raising", "learned": "idle", "tube-mpc": "timid"}
+
+    def make(name, env, settings):
+        return fakes.make_policy(makers[name], env, settings)
+
+    toolbox = library.Toolbox(make, fakes.easy_planner, fakes.load_metric, fakes.certified_radius)
+    monkeypatch.setattr("lagros_benchmarks.runner.Toolbox", lambda: toolbox)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("cartpol",), "unknown task 'cartpol'. Did you mean 'cartpole'?"),
+        (("spacecraft",), "'spacecraft' is not there yet"),
+        (("cartpole", "--policies", "lagors,lqr"), "Did you mean 'lagros'? Valid: learned,"),
+        (("cartpole", "--policies", "ppo2.zip"), "there is no file 'ppo2.zip'"),
+        (("cartpole", "--policies", ","), "policies must not be empty"),
+        (("cartpole", "--disturbance", "gusts"), "Did you mean 'gust'? Valid: none, uniform,"),
+        (("cartpole", "--bound", "0.1,much"), "--bound: 'much' is not a number"),
+        (("cartpole", "--bound", "-1"), "must be finite and >= 0"),
+        (("cartpole", "--episodes", "0"), "episodes=0"),
+        (("cartpole", "--figure", "x.gif"), "must end in .png, .pdf, .svg"),
+        (("cartpole", "--json", "/proc/none/x.json"), "cannot write"),
+    ],
+)
+def test_a_mistake_is_explained_with_status_2_and_no_traceback(invoke, arguments, message):
+    result = invoke("bench", *arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert "Traceback" not in result.output
+    assert isinstance(result.exception, SystemExit)
+
+
+def test_bench_prints_the_table_and_writes_the_files(invoke, faked, tmp_path):
+    names = ("a.json", "a.csv", "a.tex", "a.png", "a.jsonl")
+    options = ("--json", "--csv", "--latex", "--figure", "--episodes-file")
+    files = [word for pair in zip(options, names, strict=True) for word in pair]
+    result = invoke("bench", "cartpole", "--episodes", "6", "--seed", "3", *files)
+    assert result.exit_code == 0, result.output
+    for text in ("(a) learned", "(b) tube-mpc", "(c) lagros", "lqr", "Against (b) tube-mpc"):
+        assert text in result.stdout
+    assert "[bold]here[/bold]" in result.stdout
+    assert max(len(line.rstrip()) for line in result.stdout.splitlines()) <= 80
+    for name in names:
+        assert f"wrote {name}" in result.stdout
+        assert (tmp_path / name).stat().st_size > 100
+    rows = json.loads((tmp_path / "a.json").read_text())
+    assert [row["policy"] for row in rows] == ["learned", "tube-mpc", "lagros", "lqr"]
+    assert {row["seed"] for row in rows} == {3}
+
+
+def test_bench_runs_a_grid(invoke, faked, tmp_path):
+    result = invoke(
+        *("bench", "cartpole", "--policies", "lqr,learned", "--episodes", "2"),
+        *("--disturbance", "none,gust", "--bound", "0.1,0.2", "--json", "g.json"),
+    )
+    assert result.exit_code == 0, result.output
+    rows = json.loads((tmp_path / "g.json").read_text())
+    conditions = [(row["disturbance"], row["bound"]) for row in rows]
+    assert conditions == [c for c in (("none", 0.0), ("gust", 0.1), ("gust", 0.2)) for _ in "12"]
+
+
+def test_demo_writes_table_and_figure(invoke, faked, tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "DEMO", cli.DEMO | {"episodes": 3})
+    result = invoke("demo")
+    assert result.exit_code == 0, result.output
+    assert "(c) lagros" in result.stdout
+    assert "runs/demo/error.png" in result.stdout
+    assert (tmp_path / "runs/demo/error.png").exists()
+    assert len(json.loads((tmp_path / "runs/demo/results.json").read_text())) == 4
+
+
+def test_missing_weights_end_with_status_1_and_a_sentence(invoke, faked, monkeypatch):
+    def absent(name, env, settings):
+        raise FileNotFoundError("no weights")
+
+    toolbox = library.Toolbox(absent, fakes.easy_planner, fakes.load_metric, fakes.certified_radius)
+    monkeypatch.setattr("lagros_benchmarks.runner.Toolbox", lambda: toolbox)
+    result = invoke("bench", "cartpole")
+    assert result.exit_code == 1
+    assert "policy 'learned' cannot be built: FileNotFoundError: no weights" in result.stderr
+
+
+def test_help_names_every_kind_and_policy(invoke):
+    # Rich wraps and frames the help: only letters and digits count.
+    text = "".join(invoke("bench", "--help").stdout.replace("│", " ").split())
+    assert ",".join(KINDS) in text
+    assert ",".join(lagros_policies.NAMES) in text
+
+
+def test_version(invoke):
+    result = invoke("--version")
+    assert result.exit_code == 0
+    assert result.stdout.startswith("lagros ")
+
+
+def test_no_arguments_show_the_help(invoke):
+    assert "bench" in invoke().output
+
+
+def test_help_imports_nothing_heavy():
+    code = f"import sys, lagros_benchmarks.cli; print([m for m in {HEAVY} if m in sys.modules])"
+    output = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
+    assert output.strip() == "[]"

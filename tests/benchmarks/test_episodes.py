@@ -1,0 +1,168 @@
+"""One episode: what is written down, above all when something goes wrong."""
+
+from __future__ import annotations
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import lagros_envs  # noqa: F401
+from lagros_benchmarks.episodes import run_episode
+from tests.benchmarks.fakes import (
+    DrawingPolicy,
+    IdlePolicy,
+    LinearPolicy,
+    RaisingPolicy,
+    StraightPlanner,
+)
+
+
+@pytest.fixture
+def env():
+    return gym.make("lagros/CartPole-v0", disturbance="uniform", disturbance_bound=0.3)
+
+
+def nominal_of(env, seed):
+    env.reset(seed=seed)
+    scenario = env.unwrapped.scenario
+    return StraightPlanner(refuses=False).plan(scenario.initial_state, scenario.goal).states
+
+
+def seed_with_goal(env, right, start=0):
+    seed = start
+    while True:
+        env.reset(seed=seed)
+        if (env.unwrapped.scenario.goal[0] > 0.0) == right:
+            return seed
+        seed += 1
+
+
+def by_hand(env, policy, seed, nominal):
+    """The episode again, with everything computed here from the states."""
+    observation, _ = env.reset(seed=seed)
+    world = env.unwrapped
+    goal = world.scenario.goal
+    efforts, distances, errors = [], [], []
+    state, done, first = None, False, True
+    while True:
+        distances.append(np.linalg.norm(world.state - goal))
+        errors.append(np.linalg.norm(world.state - nominal[len(errors)]))
+        if done:
+            return np.array(efforts), np.array(distances), np.array(errors)
+        action, state = policy.predict(observation, state, np.array([first]))
+        observation, _, terminated, truncated, _ = env.step(action)
+        efforts.append((40.0 * float(action[0])) ** 2 * 0.1)
+        done, first = terminated or truncated, False
+
+
+def test_the_figures_of_a_success_are_those_computed_by_hand(env):
+    nominal = nominal_of(env, 3)
+    record = run_episode(env, LinearPolicy(), 3, nominal, label="mine")
+    efforts, distances, errors = by_hand(env, LinearPolicy(), 3, nominal)
+    radius = 3.15 * (1.0 - np.exp(-0.6 * 0.1 * np.arange(91)))
+    entry = int(np.argmax(distances <= radius))
+    assert record.policy == "mine"
+    assert (record.disturbance, record.bound, record.seed) == ("uniform", 0.3, 3)
+    assert record.success
+    assert record.success_time == pytest.approx(0.1 * entry)
+    assert record.strict_success == bool(distances[-1] <= radius[-1])
+    assert record.effort == pytest.approx(efforts[:entry].sum())
+    assert record.effort_total == pytest.approx(efforts.sum())
+    assert record.tracking_error == pytest.approx(errors)
+    assert record.max_tracking_error == pytest.approx(errors.max())
+    assert record.left_paper_tube == bool(np.any(errors > radius + 1e-6))
+    assert record.step_times.shape == (90,)
+    assert np.all(record.step_times > 0.0)
+    assert record.counters == {"calls": 90, "episodes": 1, "failures": 0}
+    assert record.error is None
+
+
+def test_a_fall_ends_the_episode_as_a_failure(env):
+    record = run_episode(env, IdlePolicy(), 3, nominal_of(env, 3))
+    assert record.policy == "idle"
+    assert record.fallen
+    assert not record.success
+    assert not record.strict_success
+    assert record.success_time is None
+    assert record.left_paper_tube
+    assert record.error is None
+    assert 0 < record.step_times.size < 90
+    ended = np.isnan(record.tracking_error)
+    assert not ended[: record.step_times.size + 1].any()
+    assert ended[record.step_times.size + 1 :].all()
+
+
+def test_an_exception_is_a_failure_with_its_text_on_one_line(env):
+    seed = seed_with_goal(env, right=True)
+    record = run_episode(env, RaisingPolicy(), seed, nominal_of(env, seed), certified=np.ones(91))
+    assert record.error == "ArithmeticError: no solution at all [bold]here[/bold]"
+    assert not record.success
+    assert not record.strict_success
+    assert record.left_paper_tube
+    assert record.left_certified_tube
+    assert record.step_times.size == 2
+    assert record.counters == {"calls": 2, "episodes": 1, "failures": 0}
+
+
+def test_an_action_that_the_environment_refuses_is_a_failure(env):
+    class Broken(IdlePolicy):
+        def predict(self, *args, **kwargs):
+            return np.array([math.nan]), None
+
+    record = run_episode(env, Broken(), 0, None)
+    assert "not finite" in record.error
+    assert not record.success
+
+
+def test_an_environment_that_cannot_start_is_a_failure():
+    env = gym.make("lagros/CartPole-v0", disturbance="worst", metric=np.eye(4))
+    record = run_episode(env, LinearPolicy(), 0, None)
+    assert "nominal" in record.error
+    assert not record.success
+    assert record.step_times.size == 0
+    assert np.isnan(record.tracking_error).all()
+
+
+def test_keyboard_interrupt_is_no_failure_of_the_policy(env):
+    class Interrupted(IdlePolicy):
+        def predict(self, *args, **kwargs):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_episode(env, Interrupted(), 0, None)
+
+
+def test_an_episode_without_plan_counts_as_leaving_both_tubes(env):
+    record = run_episode(env, LinearPolicy(), 3, None, certified=np.full(91, 1e9))
+    assert record.success
+    assert record.left_paper_tube
+    assert record.left_certified_tube
+    assert record.max_tracking_error is None
+
+
+def test_the_certified_tube_has_its_own_verdict(env):
+    nominal = nominal_of(env, 3)
+    assert run_episode(env, LinearPolicy(), 3, nominal).left_certified_tube is None
+    wide = run_episode(env, LinearPolicy(), 3, nominal, certified=np.full(91, 1e9))
+    tight = run_episode(env, LinearPolicy(), 3, nominal, certified=np.full(91, 1e-3))
+    assert (wide.left_certified_tube, tight.left_certified_tube) == (False, True)
+
+
+def test_a_policy_that_draws_does_so_from_the_stream_of_the_episode(env):
+    first = run_episode(env, DrawingPolicy(), 5, None)
+    again = run_episode(env, DrawingPolicy(), 5, None)
+    other = run_episode(env, DrawingPolicy(), 6, None)
+    assert first.error is None
+    assert first == again
+    assert first.effort_total != other.effort_total
+
+
+def test_the_time_of_a_slow_step_is_measured_and_its_deadline_missed(env, monkeypatch):
+    # A clock that stands still except inside the second call, which takes a second.
+    ticks = iter([0.0, 0.01, 1.0, 2.0, *np.repeat(3.0, 400)])
+    monkeypatch.setattr("lagros_benchmarks.episodes.perf_counter", lambda: next(ticks))
+    record = run_episode(env, LinearPolicy(), 3, None)
+    assert record.step_times[:3].tolist() == [0.01, 1.0, 0.0]
+    assert record.deadline_misses == 1

@@ -1,0 +1,201 @@
+"""Files, tables and figures of a run."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+
+import matplotlib.image
+import numpy as np
+import pytest
+from rich.console import Console
+
+from lagros_benchmarks import figures, files, tables
+from lagros_benchmarks.records import summarise
+from lagros_benchmarks.runner import run_benchmark
+from lagros_benchmarks.settings import BenchmarkSettings
+from tests.benchmarks import fakes
+
+POLICIES = ("steady", "idle", "raising")
+
+
+@pytest.fixture(scope="module")
+def rows():
+    settings = BenchmarkSettings(policies=POLICIES, episodes=12)
+    return summarise(run_benchmark(settings, fakes.TOOLBOX))
+
+
+@pytest.fixture(scope="module")
+def grid_rows():
+    settings = BenchmarkSettings(
+        policies=("steady", "idle"),
+        episodes=4,
+        disturbances=("none", "uniform", "constant", "gust"),
+        bounds=(0.1, 0.75),
+    )
+    return summarise(run_benchmark(settings, fakes.EASY))
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = files.write_atomic(tmp_path / "results.json", "old")
+
+    def broken(*args):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", broken)
+    with pytest.raises(OSError, match="disk full"):
+        files.write_atomic(path, "new")
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["results.json"]
+
+
+def test_others_may_read_what_is_written(tmp_path):
+    mask = os.umask(0o022)
+    try:
+        path = files.write_atomic(tmp_path / "results.json", b"{}")
+    finally:
+        os.umask(mask)
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_what_is_not_finite_becomes_null(tmp_path):
+    value = {"a": np.array([1.0, np.inf]), "b": (np.float64("nan"), np.int64(3)), "c": []}
+    path = files.write_json(tmp_path / "x.json", value)
+    assert json.loads(path.read_text()) == {"a": [1.0, None], "b": [None, 3], "c": []}
+
+
+def printed(rows):
+    console = Console(file=io.StringIO(), width=80, highlight=False)
+    for group in tables.by_condition(rows):
+        console.print(tables.terminal_table(group))
+    return console.file.getvalue()
+
+
+def wide(row):
+    """The widest figures that a run can bring."""
+    return {
+        **row,
+        "policy": "runs/a-model-with-a-very-long-name.zip",
+        "disturbance": "sinusoid",
+        "success_rate": 0.9996,
+        "success_ci95": (0.996, 1.0),
+        "effort_mean": 123456.7,
+        "step_time_median_s": 0.0123456,
+        "step_time_p99_s": 12.345,
+        "channels": "rates",
+        "episodes": 1000,
+    }
+
+
+def test_no_line_of_the_table_is_longer_than_80_columns_or_cut(rows):
+    text = printed([*rows, *(wide(row) for row in rows)])
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
+    assert "…" not in text.replace("a-model-wit…", "")
+    # Each condition and each policy has its line.
+    assert text.count("steady") == 1
+    assert text.count("a-model-wit…") == 3
+    assert "99.9 (99.6–100.0)" in text
+
+
+def test_lines_below_the_table_name_the_reference_and_the_errors(rows):
+    comparison = list(tables.comparison_lines(rows))
+    assert comparison[0] == "Against steady on the same episodes:"
+    assert all(len(line) <= 80 for line in comparison)
+    errors = list(tables.error_lines(rows, most=1))
+    assert errors[0].startswith("raising, uniform 0.75:")
+    assert "ArithmeticError" in errors[1]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "–"),
+        (float("nan"), "–"),
+        (0.0, "0"),
+        (0.01234, "0.0123"),
+        (1.0, "1.00"),
+        (95.23, "95.2"),
+        (567.8, "568"),
+        (12345.6, "12346"),
+        (1e20, "1e20"),
+        (-2.5, "-2.50"),
+    ],
+)
+def test_numbers_have_three_digits(value, text):
+    assert tables.number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("rate", "text"),
+    [(1.0, "100.0"), (0.9996, "99.9"), (0.0, "0.0"), (0.0004, "<0.1"), (0.5, "50.0"), (None, "–")],
+)
+def test_percent_rounds_to_certainty_only_if_it_is(rate, text):
+    assert tables.percent(rate) == text
+
+
+def test_the_paper_letters_its_methods():
+    assert tables.policy_label("tube-mpc") == "(b) tube-mpc"
+    assert tables.policy_label("runs/ppo.zip") == "ppo"
+
+
+def test_csv_has_a_line_per_row_and_no_curves(rows):
+    read = list(csv.DictReader(io.StringIO(tables.csv_text(rows))))
+    assert [line["policy"] for line in read] == list(POLICIES)
+    assert float(read[0]["success_ci95_low"]) == rows[0]["success_ci95"][0]
+    assert int(read[2]["errors"]) == len(rows[2]["errors"])
+    assert "time_s" not in read[0]
+    assert all(None not in line and None not in line.values() for line in read)
+
+
+def test_latex_is_a_booktabs_table_per_condition(grid_rows):
+    text = tables.latex_text([{**row, "policy": "a_b & c%"} for row in grid_rows])
+    assert text.count(r"\toprule") == text.count(r"\end{tabular}") == 7
+    body = [line for line in text.splitlines() if line.endswith(r"\\")]
+    assert len(body) == 14 + 7
+    # Escaped, so that each line has its seven columns.
+    assert all(line.replace(r"\&", "").count("&") == 6 for line in body)
+    assert r"a\_b \& c\%" in text
+
+
+def test_the_error_figure_is_drawn(rows, tmp_path):
+    path = figures.draw(rows, tmp_path / "error.png")
+    image = matplotlib.image.imread(path)
+    assert image.shape[:2] == (630, 1050)
+    # It holds lines in several colours, and not only axes.
+    assert len(np.unique(image[..., :3].reshape(-1, 3), axis=0)) > 100
+
+
+def test_the_error_figure_takes_what_json_made_of_the_rows(rows, tmp_path):
+    far = {**rows[0], "mean_tracking_error": [0.0, *np.geomspace(0.1, 500.0, 88), np.inf, np.inf]}
+    again = json.loads(json.dumps(files.plain([far, *rows[1:]])))
+    assert figures.error_figure(again, tmp_path / "log.png").stat().st_size > 10_000
+
+
+def test_the_success_figure_is_drawn(grid_rows, tmp_path):
+    path = figures.draw(grid_rows, tmp_path / "grid.png")
+    height, width = matplotlib.image.imread(path).shape[:2]
+    assert (width, height) == (1170, 825)
+
+
+@pytest.mark.parametrize("suffix", ["pdf", "svg"])
+def test_figures_for_print(rows, tmp_path, suffix):
+    path = figures.error_figure(rows, tmp_path / f"error.{suffix}")
+    assert path.stat().st_size > 5_000
+
+
+def test_a_figure_says_what_it_cannot_draw(rows, grid_rows, tmp_path):
+    with pytest.raises(ValueError, match="must end in"):
+        figures.error_figure(rows, tmp_path / "error.gif")
+    with pytest.raises(ValueError, match="one condition"):
+        figures.error_figure(grid_rows, tmp_path / "error.png")
+    with pytest.raises(ValueError, match="every nominal plan failed"):
+        figures.error_figure([{**rows[0], "mean_tracking_error": None}], tmp_path / "error.png")
+
+
+def test_known_policies_always_look_the_same_and_all_differ():
+    names = ["lagros", "x.zip", "tube-mpc", "y.zip", "learned", "lqr", "ppo", "random"]
+    found = figures.styles(names)
+    assert found["lagros"] == figures.styles(["lagros"])["lagros"]
+    assert len({(style.colour, str(style.line)) for style in found.values()}) == len(names)

@@ -1,0 +1,71 @@
+"""Settings are checked when they are built; evaluation never meets a training scenario."""
+
+from __future__ import annotations
+
+import pytest
+
+import lagros_policies
+from lagros_benchmarks.settings import BenchmarkSettings, check_policy
+from lagros_envs.seeding import EVALUATION, episode_seeds
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"task": "cartpol"}, "Did you mean 'cartpole'"),
+        ({"task": "spacecraft"}, "not there yet"),
+        ({"disturbances": ("unifrom",)}, "Did you mean 'uniform'.*none, uniform, sphere"),
+        ({"bounds": (float("nan"),)}, "finite"),
+        ({"bounds": (-0.1,)}, ">= 0"),
+        ({"bounds": ()}, "bounds must not be empty"),
+        ({"policies": ("lqr", "lqr")}, "twice"),
+        ({"channels": "rate"}, "Did you mean 'rates'"),
+        ({"episodes": 0}, "episodes=0 must be at least 1"),
+        ({"jobs": -1}, "jobs=-1 must be at least 1"),
+        ({"chunk": 0}, "chunk"),
+        ({"seed": -1}, "non-negative"),
+        ({"policy_settings": {"ppo": {}}}, "ppo"),
+    ],
+)
+def test_a_wrong_setting_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        BenchmarkSettings(**changes)
+
+
+def test_every_kind_meets_every_bound_and_none_comes_once():
+    settings = BenchmarkSettings(disturbances=("none", "gust"), bounds=(0.1, 0.2))
+    assert settings.conditions == (("none", 0.0), ("gust", 0.1), ("gust", 0.2))
+
+
+def test_a_longer_run_begins_with_a_shorter():
+    assert (
+        BenchmarkSettings(episodes=20).episode_seeds()[:5]
+        == BenchmarkSettings(episodes=5).episode_seeds()
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 1, 12345])
+def test_evaluation_never_meets_a_training_scenario(seed):
+    evaluation = set(BenchmarkSettings(seed=seed, episodes=2000).episode_seeds())
+    # Also not of a training seed that holds the namespace itself in its next word.
+    for training_seed in (0, 1, seed, seed + (EVALUATION << 32), EVALUATION):
+        assert evaluation.isdisjoint(episode_seeds(training_seed, 2000))
+
+
+@pytest.mark.parametrize("name", lagros_policies.NAMES)
+def test_every_name_of_the_library_is_a_policy(name):
+    check_policy(name)
+
+
+def test_a_policy_may_be_a_file(tmp_path):
+    model = tmp_path / "model.zip"
+    model.write_bytes(b"")
+    check_policy(str(model))
+    check_policy(f"sac:{model}")
+    with pytest.raises(ValueError, match=r"there is no file 'missing.zip'"):
+        check_policy("missing.zip")
+
+
+def test_a_mistyped_policy_gets_a_suggestion_and_the_list():
+    with pytest.raises(ValueError, match=r"Did you mean 'tube-mpc'\? Valid: learned, tube-mpc"):
+        check_policy("tubempc")

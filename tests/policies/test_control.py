@@ -1,0 +1,330 @@
+"""u* against the programs that define it, and the closed loop against Theorem 2."""
+
+import gymnasium as gym
+import numpy as np
+import osqp
+import pytest
+import scipy.optimize
+import scipy.sparse
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+import lagros_envs  # noqa: F401  registers the environment
+from lagros_policies.contraction import (
+    CvStemSettings,
+    HeldControl,
+    Metric,
+    certified_tube,
+    robust_control,
+)
+
+unit = st.floats(-1.0, 1.0)
+# x_d within the region, e within its box, u_d.
+triples = st.tuples(
+    st.tuples(unit, unit, unit, unit),
+    st.tuples(unit, unit, unit, unit),
+    unit,
+)
+
+
+def as_triple(drawn):
+    nominal, error, force = drawn
+    nominal = np.array(nominal) * [5.0, 0.9, 3.0, 2.0]
+    error = np.array(error) * [1.0, 0.2, 2.0, 1.0]
+    return nominal + error, nominal, np.array([30.0 * force])
+
+
+def least_deviation(phi_0, phi_1):
+    """Return min ||v||^2 s.t. phi_0 + phi_1'v <= 0, by OSQP; rows scaled to one for its sake."""
+    size = np.linalg.norm(phi_1)
+    solver = osqp.OSQP()
+    unknowns = len(phi_1)
+    # In units of the distance to the constraint, so that OSQP's tolerance is relative.
+    distance = abs(phi_0) / size
+    solver.setup(
+        scipy.sparse.eye(unknowns, format="csc"),
+        np.zeros(unknowns),
+        scipy.sparse.csc_matrix((phi_1 / size)[None]),
+        np.array([-np.inf]),
+        np.array([-np.sign(phi_0)]),
+        verbose=False,
+        eps_abs=1e-9,
+        eps_rel=1e-9,
+        max_iter=100_000,
+    )
+    answer = solver.solve()
+    assert answer.info.status == "solved"
+    return distance * answer.x
+
+
+class TwoForces:
+    """A body in the plane under two oblique forces, with a drift that is not linear."""
+
+    state_dim, control_dim = 4, 2
+
+    def derivative(self, state, control, functions):
+        x, angle, v, w = state
+        push = functions.cos(angle) * control[0] + 0.3 * control[1]
+        turn = (0.2 + 0.1 * functions.sin(x)) * control[0] - control[1]
+        return v, w, push - 0.4 * v + x * w, turn + functions.sin(angle) - 0.1 * w * v
+
+    def rates(self, state, control):
+        return np.stack(self.derivative(list(state), list(control), np))
+
+
+@given(triples, st.sampled_from([0.5, 2.0]))
+def test_robust_control_solves_the_program_of_the_cart_pole(metric, system, oracle, drawn, rate):
+    state, nominal, nominal_control = as_triple(drawn)
+    energy = oracle.energy(metric, state, nominal)
+    assume(energy > 1e-6)
+
+    def excess(control):
+        moving = oracle.energy_rate(metric, state, nominal, nominal_control, control)
+        return moving + 2.0 * rate * energy
+
+    phi_0 = excess(nominal_control)
+    phi_1 = (excess(nominal_control + 1.0) - excess(nominal_control - 1.0)) / 2.0
+    # Where V hardly depends on u, and at the switch, differences of V say nothing.
+    assume(abs(phi_1) > 1e-3 * energy)
+    assume(abs(phi_0) > 1e-6 * energy)
+    deviation = robust_control(system, metric, rate, state, nominal, nominal_control)
+    deviation = deviation - nominal_control
+    expected = least_deviation(phi_0, np.array([phi_1])) if phi_0 > 0.0 else np.zeros(1)
+    assert deviation == pytest.approx(expected, rel=1e-4, abs=1e-4)
+
+
+@given(
+    st.lists(unit, min_size=4, max_size=4),
+    st.lists(unit, min_size=4, max_size=4),
+    st.lists(unit, min_size=2, max_size=2),
+)
+def test_robust_control_solves_the_program_of_two_controls(metric, state, error, control):
+    system, rate = TwoForces(), 0.8
+    state, error = np.array(state), np.array(error)
+    assume(np.linalg.norm(error) > 0.05)
+    nominal, control = state - error, np.array(control)
+    matrix = np.linalg.inv(metric.dual(state))
+    h = 1e-6
+    turned = [
+        np.linalg.inv(metric.dual(state + side * h * system.rates(state, control)))
+        for side in (1, -1)
+    ]
+    # The condition (18), term by term.
+    drift = system.rates(state, control) - system.rates(nominal, control)
+    slope = (turned[0] - turned[1]) / (2 * h)
+    phi_0 = 2 * error @ matrix @ drift + error @ (slope + 2 * rate * matrix) @ error
+    gain = np.stack(
+        [system.rates(state, row) - system.rates(state, 0 * row) for row in np.eye(2)], -1
+    )
+    phi_1 = 2 * gain.T @ matrix @ error
+    assume(np.linalg.norm(phi_1) > 1e-6 * np.linalg.norm(matrix))
+    assume(abs(phi_0) > 1e-9)
+    expected = control + (least_deviation(phi_0, phi_1) if phi_0 > 0.0 else 0.0)
+    found = robust_control(system, metric, rate, state, nominal, control)
+    assert found == pytest.approx(expected, rel=1e-5, abs=1e-6)
+
+
+def test_robust_control_without_error_is_the_nominal_control(metric, system, samples):
+    control = robust_control(
+        system, metric, 0.5, samples.nominal, samples.nominal, samples.nominal_control
+    )
+    assert np.array_equal(control, samples.nominal_control)
+
+
+def test_robust_control_of_a_batch_is_that_of_its_rows(metric, system, samples):
+    state, nominal, control = samples.state, samples.nominal, samples.nominal_control
+    batch = robust_control(system, metric, 0.5, state, nominal, control)
+    cube = robust_control(
+        system,
+        metric,
+        0.5,
+        state.reshape(10, 20, 4),
+        nominal.reshape(10, 20, 4),
+        control.reshape(10, 20, 1),
+    )
+    rows = [
+        robust_control(system, metric, 0.5, *row) for row in zip(state, nominal, control, strict=True)
+    ]
+    assert batch == pytest.approx(np.stack(rows), rel=1e-9, abs=1e-9)
+    assert np.array_equal(cube.reshape(200, 1), batch)
+
+
+def held_condition(oracle, metric, rate, state, nominal, nominal_control):
+    """Return v -> V(next, linear in v) - exp(-2 rate dt) V(now), and the slope of the next state."""
+    period = oracle.period
+    following = oracle.step(state, nominal_control)
+    error = following - oracle.step(nominal, nominal_control)
+    slope = oracle.jacobian(lambda u: oracle.step(state.astype(complex), u), nominal_control)[:, 0]
+    matrix = np.linalg.inv(metric.dual(following))
+    limit = np.exp(-2.0 * rate * period) * oracle.energy(metric, state, nominal)
+
+    def condition(deviation):
+        predicted = error + slope * deviation
+        return predicted @ matrix @ predicted - limit
+
+    return condition
+
+
+@given(triples, st.sampled_from([0.2, 0.5, 2.0, 8.0]))
+def test_held_control_is_the_least_that_meets_its_condition(metric, system, oracle, drawn, rate):
+    state, nominal, nominal_control = as_triple(drawn)
+    energy = oracle.energy(metric, state, nominal)
+    assume(energy > 1e-6)
+    law = HeldControl(system, metric, rate, oracle.period)
+    deviation = float((law(state, nominal, nominal_control) - nominal_control)[0])
+    condition = held_condition(oracle, metric, rate, state, nominal, nominal_control)
+    lowest = scipy.optimize.minimize_scalar(condition, options={"xtol": 1e-12})
+    assume(abs(condition(0.0)) > 1e-6 * energy)
+    assume(abs(lowest.fun) > 1e-6 * energy)
+    if condition(0.0) < 0.0:
+        assert deviation == 0.0
+    elif lowest.fun > 0.0:  # no v will do: the one of least energy
+        assert deviation == pytest.approx(lowest.x, rel=1e-4, abs=1e-4)
+    else:
+        least = scipy.optimize.brentq(condition, 0.0, lowest.x, xtol=1e-11)
+        assert deviation == pytest.approx(least, rel=1e-5, abs=1e-5)
+        assert condition(deviation) <= 1e-7 * energy
+
+
+def test_every_branch_of_the_held_control_occurs(metric, system, oracle, samples):
+    # The property above says little if the drawn states never reach a branch.
+    found = set()
+    for rate in (0.5, 8.0):
+        for row in zip(samples.state, samples.nominal, samples.nominal_control, strict=True):
+            condition = held_condition(oracle, metric, rate, *row)
+            lowest = scipy.optimize.minimize_scalar(condition).fun
+            found.add("rests" if condition(0.0) < 0.0 else "acts" if lowest < 0.0 else "fails")
+    assert found == {"rests", "acts", "fails"}
+
+
+def test_held_control_agrees_with_the_nonlinear_prediction_for_small_errors(
+    metric, system, oracle, samples
+):
+    law = HeldControl(system, metric, 0.5, oracle.period)
+    acted = 0
+    for state, nominal, control in zip(
+        samples.state[:60], samples.nominal[:60], samples.nominal_control[:60], strict=True
+    ):
+        state = nominal + 1e-3 * (state - nominal)
+        limit = np.exp(-2.0 * 0.5 * oracle.period) * oracle.energy(metric, state, nominal)
+
+        def condition(v, state=state, nominal=nominal, control=control, limit=limit):
+            following = oracle.step(state, control + v), oracle.step(nominal, control)
+            return oracle.energy(metric, *following) / limit - 1.0
+
+        deviation = float((law(state, nominal, control) - control)[0])
+        if condition(0.0) <= 0.0:
+            assert abs(deviation) < 1e-2
+            continue
+        lowest = scipy.optimize.minimize_scalar(condition, bracket=(-1.0, 1.0))
+        if lowest.fun < -1e-3:
+            acted += 1
+            least = scipy.optimize.brentq(condition, 0.0, lowest.x)
+            assert deviation == pytest.approx(least, rel=2e-2, abs=1e-3)
+    assert acted > 10
+
+
+def test_held_control_refuses_two_controls(metric):
+    with pytest.raises(ValueError, match="one control"):
+        HeldControl(TwoForces(), metric, 0.5, 0.1)
+
+
+def test_continuous_loop_contracts_at_the_rate_of_theorem_2(metric, system, oracle, plans):
+    # 20 errors around a plan each, one second, the control renewed every millisecond.
+    states, controls = plans
+    rng = np.random.default_rng(8)
+    chosen, start = rng.integers(len(states), size=20), 10
+    nominal = states[chosen, start]
+    state = nominal + rng.uniform(-1.0, 1.0, (20, 4)) * [0.5, 0.1, 0.5, 0.3]
+    rate, h = metric.contraction_rate, 1e-3
+    before = oracle.energy(metric, state, nominal)
+    for step in range(start, start + 10):
+        nominal_control = controls[chosen, step]
+        for _ in range(100):
+            control = robust_control(system, metric, rate, state, nominal, nominal_control)
+            state = oracle.step(state, control, h, 1)
+            nominal = oracle.step(nominal, nominal_control, h, 1)
+        after = oracle.energy(metric, state, nominal)
+        assert np.all(after <= before * np.exp(-2.0 * rate * 0.1) * 1.01)
+        before = after
+
+
+def test_held_loop_contracts_without_disturbance(metric, system, oracle, plans):
+    states, controls = plans
+    rng = np.random.default_rng(9)
+    law = HeldControl(system, metric, metric.contraction_rate, oracle.period)
+    state = states[:, 0] + rng.uniform(-1.0, 1.0, (len(states), 4)) * [0.3, 0.05, 0.3, 0.15]
+    first = before = oracle.energy(metric, state, states[:, 0])
+    for step in range(controls.shape[1]):
+        control = law(state, states[:, step], controls[:, step])
+        state = oracle.step(state, control)
+        after = oracle.energy(metric, state, states[:, step + 1])
+        # The law predicts linearly: it may miss the rate by a little, the decrease never.
+        assert np.all(after < before)
+        before = after
+    assert np.all(before < first * np.exp(-2.0 * 0.95 * metric.contraction_rate * 9.0))
+
+
+@pytest.mark.parametrize("kind", ["angle", "constant"])
+def test_certified_bound_holds_under_the_worst_disturbance(
+    request, system, oracle, plans, region, kind
+):
+    metric = request.getfixturevalue("metric" if kind == "angle" else "constant_metric")
+    bound, rate = 0.06, metric.contraction_rate
+    env = gym.make(
+        "lagros/CartPole-v0",
+        disturbance="worst",
+        disturbance_bound=bound,
+        metric=metric.matrix,
+    )
+    law = HeldControl(system, metric, rate, oracle.period)
+    tube = certified_tube(metric, bound)
+    largest = np.sqrt(metric.extreme_eigenvalues()[1])
+    reached = np.zeros(2)
+    for episode, (states, controls) in enumerate(zip(*plans, strict=True)):
+        if episode == 4:
+            break
+        options = {"initial_state": states[0], "goal": states[-1], "nominal": states}
+        env.reset(seed=episode, options=options)
+        for step, nominal_control in enumerate(controls):
+            state = env.unwrapped.state
+            assert region.contains(state, states[step], nominal_control)
+            force = law(state, states[step], nominal_control)
+            *_, info = env.step(force / env.unwrapped.settings.force_scale)
+            assert np.linalg.norm(info["disturbance"]) == pytest.approx(bound)
+            time = (step + 1) * oracle.period
+            energy = oracle.energy(metric, env.unwrapped.state, states[step + 1])
+            # Theorem 1 in the metric's own length R, and then in that of the state.
+            shares = np.array(
+                [
+                    np.sqrt(energy) / (largest * bound / rate * -np.expm1(-rate * time)),
+                    info["tracking_error"] / tube.radius(time),
+                ]
+            )
+            assert np.all(shares <= 1.0)
+            reached = np.maximum(reached, shares)
+    env.close()
+    # The bound is not so wide that anything would keep it: without feedback the pole falls.
+    assert reached[0] > 0.05
+    env.reset(seed=0, options={"initial_state": plans[0][0, 0], "nominal": plans[0][0]})
+    for nominal_control in plans[1][0]:
+        *_, info = env.step(nominal_control / env.unwrapped.settings.force_scale)
+    assert info["fallen"]
+    assert info["tracking_error"] > 3.0 * tube.radius(9.0) * reached[1]
+
+
+def test_metric_of_any_degree_has_the_interface_of_the_law(system, oracle, samples, region):
+    # A metric from nowhere, to show that the law needs a Metric and not a design.
+    rng = np.random.default_rng(3)
+    root = rng.standard_normal((4, 4))
+    metric = Metric(
+        coefficients=np.stack([root @ root.T + np.eye(4), 0.1 * np.eye(4), 0.2 * np.eye(4)]),
+        contraction_rate=CvStemSettings().contraction_rate,
+        condition_bound=100.0,
+        control_weight=1.0,
+        scaling=np.ones(4),
+        region=region,
+    )
+    assert metric.degree == 2
+    law = HeldControl(system, metric, 0.3, oracle.period)
+    assert np.all(np.isfinite(law(samples.state, samples.nominal, samples.nominal_control)))
