@@ -321,13 +321,20 @@ class CartPoleRenderer:
 
         axes = [(left, top), (left, top + height), (left + width, top + height)]
         self._pygame.draw.lines(self._canvas, GREY, False, axes, OVERSAMPLING)
-        for entry, colour, name in ((2, SKY_BLUE, "r(t)"), (1, BLACK, "||x − x_f||")):
+        curves = ((2, SKY_BLUE, "r(t)"), (1, BLACK, "||x − x_f||"))
+        gap = 13 * OVERSAMPLING
+        # The labels lie beside the ends of the curves, but not over each other or the axis.
+        upper = place(time, max(radius, distance))[1]
+        lower = max(place(time, min(radius, distance))[1], upper + gap)
+        lower = min(lower, top + height - 0.6 * gap)
+        upper = min(upper, lower - gap)
+        levels = (upper, lower) if radius > distance else (lower, upper)
+        for (entry, colour, name), level in zip(curves, levels, strict=True):
             points = [place(row[0], row[entry]) for row in self._history]
             for start, end in itertools.pairwise(points):
                 self._line(start, end, colour, 2)
             self._pygame.draw.circle(self._canvas, colour, points[-1], 3.5 * OVERSAMPLING)
-            above_axis = min(points[-1][1], top + height - 8 * OVERSAMPLING)
-            beside = (points[-1][0] + 8 * OVERSAMPLING, above_axis)
+            beside = (points[-1][0] + 8 * OVERSAMPLING, level)
             self._text(name, beside, _mix(BLACK, 0.75), 17, anchor="midleft")
         below = top + height + 9 * OVERSAMPLING
         self._text("0", (left, below), GREY, 17, anchor="center")

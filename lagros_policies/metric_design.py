@@ -45,8 +45,8 @@ class MetricDesignSettings:
         ValueError: A number is not positive.
     """
 
-    plans: int = 400
-    pool: int = 20_000
+    plans: int = 1000
+    pool: int = 60_000
     checks: int = 10_000
     seed: int = 0
     cvstem: CvStemSettings = field(default_factory=CvStemSettings)

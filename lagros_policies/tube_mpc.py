@@ -13,12 +13,16 @@ from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
 from lagros_policies.contraction import Metric, load_metric
-from lagros_policies.expert import CartPoleExpert
+from lagros_policies.expert import CartPoleExpert, TrackedPlans
 from lagros_policies.planning import Trajectory
 from lagros_policies.policy import PolicyState
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
+
+
+# Forces that differ by less are one plan; the solver's own tolerance is below it [N].
+_SAME_FORCE = 1e-2
 
 
 @dataclass
@@ -27,6 +31,7 @@ class TubeMpcState:
 
     Attributes:
         plan: The plan in force; its last step is the time limit. None before the first succeeds.
+        tracked: The same, prepared for tracking.
         goal: The goal it was made for.
         plans: Plans asked for.
         failed_plans: Plans that did not hold; the last one stayed in force.
@@ -34,6 +39,7 @@ class TubeMpcState:
     """
 
     plan: Trajectory | None = None
+    tracked: TrackedPlans | None = None
     goal: FloatArray = field(default_factory=lambda: np.full(task.STATE_DIM, np.nan))
     plans: int = 0
     failed_plans: int = 0
@@ -120,11 +126,11 @@ class TubeMpcPolicy:
         moved = not np.array_equal(goal, memory.goal)
         if memory.plan is None or moved or step % self.replan_every == 0:
             self._renew(row, goal, step, memory)
-        plan = memory.plan
-        if plan is None:
+        if memory.tracked is None:
             return np.zeros(1)
-        index = step - (settings.steps - plan.horizon)
-        return self.expert.control(row[task.STATE], plan.states[index], plan.controls[index])
+        state = row[None, task.STATE]
+        force = self.expert.control(memory.tracked, np.zeros(1, int), np.full(1, step), state)
+        return force.reshape(1)
 
     def _renew(self, row: FloatArray, goal: FloatArray, step: int, memory: TubeMpcState) -> None:
         plan = memory.plan
@@ -138,5 +144,16 @@ class TubeMpcPolicy:
         memory.plans += 1
         memory.late_plans += late
         memory.failed_plans += not renewed.solved
-        if renewed.solved and (plan is None or not late):
-            memory.plan, memory.goal = renewed, goal.copy()
+        if not renewed.solved or (late and plan is not None):
+            return
+        memory.goal = goal.copy()
+        if plan is not None and _confirms(renewed, plan):
+            return
+        memory.plan = renewed
+        memory.tracked = self.expert.track(renewed.states[None], renewed.controls[None], step)
+
+
+def _confirms(renewed: Trajectory, plan: Trajectory) -> bool:
+    """Whether a re-plan is the rest of the plan in force, to the planner's accuracy."""
+    change = np.abs(renewed.controls - plan.controls[-renewed.horizon :])
+    return bool(np.max(change) <= _SAME_FORCE)

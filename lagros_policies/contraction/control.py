@@ -91,12 +91,13 @@ class HeldControl:
 
     The continuous law asks for dV/dt <= -2 alpha V at the instant only; over a hold of 0.1 s the
     energy then overshoots. Here the next error is predicted by the Runge-Kutta map F, linear in
-    the deviation v = u - u_d, and v is the least with
+    the deviation v = u - u_d, and v must satisfy
 
         (e' + G v)' M(x') (e' + G v) <= exp(-2 alpha dt) e'Me,  e' = F(x, u_d) - F(x_d, u_d),
 
-    G = dF/du(x, u_d), x' = F(x, u_d). One control, so the condition is a quadratic in v and the
-    least root is closed form. Where no v meets it, the v of least energy is taken.
+    G = dF/du(x, u_d), x' = F(x, u_d). With one control that is an interval, whose point nearest to
+    the preferred v is taken: for a preferred v of zero the least deviation, as in (17). Where the
+    interval is empty, outside the metric's region, the v of least energy is taken.
 
     Attributes:
         system: A system with one control.
@@ -105,7 +106,7 @@ class HeldControl:
         period: Control period dt [s].
 
     Raises:
-        ValueError: The system has more than one control.
+        ValueError: The system has more than one control, or the rate exceeds the metric's.
     """
 
     system: System
@@ -114,11 +115,16 @@ class HeldControl:
     period: float
 
     def __post_init__(self) -> None:
-        """Check the system."""
+        """Check system and rate."""
         if self.system.control_dim != 1:
             raise ValueError(
                 f"HeldControl is closed form for one control, not {self.system.control_dim}; "
                 "use robust_control"
+            )
+        if not 0.0 < self.rate <= self.metric.contraction_rate:
+            raise ValueError(
+                f"rate={self.rate!r} must be positive and at most the metric's own "
+                f"{self.metric.contraction_rate!r}: a faster law is not feasible everywhere"
             )
 
     def quadratic(
@@ -136,17 +142,42 @@ class HeldControl:
         c = error_energy(matrix, error) - np.exp(-2.0 * self.rate * self.period) * before
         return a, b, c
 
-    def __call__(
+    def interval(
         self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
-    ) -> FloatArray:
-        """Return u*, shape (..., 1), for x (..., n), x_d (..., n), u_d (..., 1)."""
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the least and the largest v that contract, each (...).
+
+        Args:
+            state: x, shape (..., n).
+            nominal: x_d, shape (..., n).
+            nominal_control: u_d, shape (..., 1).
+
+        Returns:
+            Both ends; where nothing contracts, both are the v of least energy.
+        """
         a, b, c = self.quadratic(state, nominal, nominal_control)
         root = np.sqrt(np.maximum(b * b - a * c, 0.0))
-        # c > 0: both roots have the sign of -b; the smaller one, without cancellation.
-        far = b + np.copysign(root, b)
-        feasible = b * b >= a * c
-        safe = np.where(far == 0.0, 1.0, far)
-        least = np.where(feasible & (far != 0.0), -c / safe, -b / a)
-        deviation = np.where(c > 0.0, least, 0.0)
+        return (-b - root) / a, (-b + root) / a
+
+    def __call__(
+        self,
+        state: FloatArray,
+        nominal: FloatArray,
+        nominal_control: FloatArray,
+        preferred: FloatArray | float = 0.0,
+    ) -> FloatArray:
+        """Return u*, shape (..., 1).
+
+        Args:
+            state: x, shape (..., n).
+            nominal: x_d, shape (..., n).
+            nominal_control: u_d, shape (..., 1).
+            preferred: v that is taken where it contracts, shape (...).
+
+        Returns:
+            u_d plus the contracting v nearest to the preferred one.
+        """
+        low, high = self.interval(state, nominal, nominal_control)
+        deviation = np.clip(preferred, low, high)
         control: FloatArray = nominal_control + deviation[..., None]
         return control

@@ -58,11 +58,11 @@ class CvStemSettings:
         ValueError: A value is out of range.
     """
 
-    contraction_rate: float = 0.6
-    degree: int = 0
-    control_penalty: float = 1e-2
-    margin: float = 0.02
-    scaling: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
+    contraction_rate: float = 0.3
+    degree: int = 4
+    control_penalty: float = 0.1
+    margin: float = 0.05
+    scaling: tuple[float, ...] = (1.0, 12.0, 1.0, 1.5)
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -102,7 +102,8 @@ class Metric:
         verification: The independent check, or None.
 
     Raises:
-        ValueError: The arrays do not fit each other or are not symmetric.
+        ValueError: The arrays do not fit each other or are not symmetric, or a number is out of
+            range.
     """
 
     coefficients: FloatArray
@@ -123,6 +124,13 @@ class Metric:
             )
         if not np.allclose(self.coefficients, np.swapaxes(self.coefficients, 1, 2)):
             raise ValueError("every coefficient of W_bar must be symmetric")
+        numbers = (self.contraction_rate, self.condition_bound, self.control_weight, *self.scaling)
+        if not (
+            np.all(np.isfinite(self.coefficients)) and all(0.0 < n < math.inf for n in numbers)
+        ):
+            raise ValueError("W_bar must be finite; alpha, chi, nu and scaling finite and positive")
+        if self.condition_bound < 1.0:
+            raise ValueError(f"condition_bound={self.condition_bound!r} must be at least 1")
 
     @property
     def degree(self) -> int:

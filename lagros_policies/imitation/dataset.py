@@ -23,7 +23,7 @@ from lagros_envs.disturbances import OPEN_LOOP, into_unit_ball
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_policies.contraction import Metric
-from lagros_policies.expert import CartPoleExpert
+from lagros_policies.expert import CartPoleExpert, TrackedPlans
 from lagros_policies.files import write_atomic
 
 FloatArray = NDArray[np.float64]
@@ -172,6 +172,7 @@ def make_shard(
             plans.append(plan)
     states = np.stack([plan.states for plan in plans])
     controls = np.stack([plan.controls for plan in plans])
+    tracked = expert.track(states, controls)
     rng = np.random.default_rng([settings.seed, index])
     wanted = settings.samples // settings.shards
     parts: list[tuple[FloatArray, FloatArray, IntArray]] = []
@@ -182,7 +183,7 @@ def make_shard(
                 f"only {kept} of {drawn} states lie in the verified region {metric.region}: "
                 "verify a larger region or lower disturbance_bound"
             )
-        points, plan_of, step = tube_states(rng, expert, states, controls, settings)
+        points, plan_of, step = tube_states(rng, expert, tracked, settings)
         choice = rng.permutation(len(points))
         points, plan_of, step = points[choice], plan_of[choice], step[choice]
         nominal, nominal_control = states[plan_of, step], controls[plan_of, step]
@@ -192,7 +193,7 @@ def make_shard(
         points, plan_of, step = points[:needed], plan_of[:needed], step[:needed]
         inside, drawn = inside[:needed], drawn + len(points)
         points, plan_of, step = points[inside], plan_of[inside], step[inside]
-        label = expert.control(points, states[plan_of, step], controls[plan_of, step])
+        label = expert.control(tracked, plan_of, step, points)
         parts.append((observations(points, states[plan_of], step, task_settings), label, plan_of))
         kept += len(points)
     observation, control, plan_of = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -209,8 +210,7 @@ def make_shard(
 def tube_states(
     rng: np.random.Generator,
     expert: CartPoleExpert,
-    states: FloatArray,
-    controls: FloatArray,
+    tracked: TrackedPlans,
     settings: ExpertDataSettings,
 ) -> tuple[FloatArray, IntArray, IntArray]:
     """Fill the tube around each plan: u* in closed loop under random disturbances (Theorem 4).
@@ -221,14 +221,15 @@ def tube_states(
     Args:
         rng: Random generator.
         expert: The law u*.
-        states: x_d, shape (p, N + 1, 4).
-        controls: u_d, shape (p, N, 1).
+        tracked: The plans.
         settings: What to generate.
 
     Returns:
         States (p N, 4), the plan and the step of each.
     """
-    plans, steps = controls.shape[:2]
+    states = tracked.states
+    plans, steps = tracked.controls.shape[:2]
+    every = np.arange(plans)
     period = expert.task.control_period
     # Every bound down to zero: the tube of a small disturbance lies inside that of a large one.
     bound: FloatArray = settings.disturbance_bound * rng.random((plans, 1, 1))
@@ -243,7 +244,7 @@ def tube_states(
     met = np.empty((plans, steps, states.shape[-1]))
     for step in range(steps):
         met[:, step] = state
-        control = expert.control(state, states[:, step], controls[:, step])
+        control = expert.control(tracked, every, np.full(plans, step), state)
         state = hold_step(expert.task.system, state, control, period, pushes[:, step])
     spread = settings.spread * settings.disturbance_bound * period
     noise = into_unit_ball(rng.standard_normal(met.shape)) * rng.random((plans, steps, 1))

@@ -86,16 +86,22 @@ class CartPolePlanner:
             The plan, over task.steps - start_step steps.
 
         Raises:
-            ValueError: No step remains, or a state is misshapen or not finite.
+            ValueError: No step remains, the guess is shorter than what remains, or a state is
+                misshapen or not finite.
         """
         for name, vector in (("initial_state", initial_state), ("goal", goal)):
             if np.shape(vector) != (4,) or not np.all(np.isfinite(vector)):
                 raise ValueError(f"{name}={vector!r} must be 4 finite numbers")
         horizon = self.task.steps - start_step
-        if horizon < 1:
+        if not 1 <= horizon <= self.task.steps:
             raise ValueError(
-                f"start_step={start_step} leaves no step before the time limit "
-                f"({self.task.steps} steps)"
+                f"start_step={start_step} is not one of the {self.task.steps} steps before the "
+                "time limit"
+            )
+        if guess is not None and guess.horizon < horizon:
+            raise ValueError(
+                f"guess covers {guess.horizon} steps, but {horizon} remain from "
+                f"start_step={start_step}"
             )
         times = self.task.control_period * np.arange(start_step + 1.0, self.task.steps)
         high = np.full((horizon - 1, 4), np.inf)

@@ -146,9 +146,7 @@ def make_samples():
 
 @pytest.fixture(scope="session")
 def region():
-    return Region(
-        angle=1.15, angular_rate=4.0, angle_error=0.2, angular_rate_error=1.0, force=40.0
-    )
+    return Region(angle=1.15, angular_rate=4.0, angle_error=0.2, angular_rate_error=1.0, force=40.0)
 
 
 @pytest.fixture(scope="session")
@@ -157,22 +155,27 @@ def plans():
 
 
 @pytest.fixture(scope="session")
-def samples(region, plans):
-    """Return 200 triples; the metrics below satisfy the condition at each of them."""
-    return draw_samples(region, plans, 200, seed=1)
+def pool(region, plans):
+    """Return 2000 triples; the metrics below satisfy the condition at each of them."""
+    return draw_samples(region, plans, 2000, seed=1)
 
 
 @pytest.fixture(scope="session")
-def metric(system, region, samples):
-    """Return a metric that depends on the angle."""
-    settings = CvStemSettings(0.5, degree=2, control_penalty=0.1, margin=0.1)
-    return design_on_pool(system, samples, region, settings)
+def samples(pool):
+    return pool.take(np.arange(200))
 
 
 @pytest.fixture(scope="session")
-def constant_metric(system, region, samples):
-    settings = CvStemSettings(0.5, degree=0, control_penalty=0.1, margin=0.1)
-    return design_on_pool(system, samples, region, settings)
+def metric(system, region, pool):
+    """Return a metric that depends on the angle, designed in scaled states."""
+    settings = CvStemSettings(0.5, 2, 0.1, margin=0.1, scaling=(1.0, 3.0, 1.0, 1.5))
+    return design_on_pool(system, pool, region, settings)
+
+
+@pytest.fixture(scope="session")
+def constant_metric(system, region, pool):
+    settings = CvStemSettings(0.5, 0, 0.1, margin=0.1, scaling=(1.0, 1.0, 1.0, 1.0))
+    return design_on_pool(system, pool, region, settings)
 
 
 @pytest.fixture(scope="session")

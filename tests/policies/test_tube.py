@@ -15,7 +15,7 @@ TIMES = np.linspace(0.0, 9.0, 31)
 
 def integrate(rate_of, start):
     answer = scipy.integrate.solve_ivp(
-        lambda t, y: rate_of(y), (0.0, 9.0), [start], t_eval=TIMES, rtol=1e-9, atol=1e-12
+        lambda t, y: rate_of(y), (0.0, 9.0), [start], t_eval=TIMES, rtol=1e-9, atol=1e-13
     )
     return answer.y[0]
 
@@ -44,7 +44,11 @@ def test_radius_solves_the_comparison_equation_of_theorem_1(
 
 
 @given(
-    lipschitz=st.floats(0.05, 2.0), disturbance=bounds, error=bounds, gain=bounds, start=bounds
+    lipschitz=st.floats(0.05, 2.0),
+    disturbance=bounds,
+    error=bounds,
+    gain=bounds,
+    start=bounds,
 )
 def test_diverging_bound_solves_the_equation_of_gronwall(
     lipschitz, disturbance, error, gain, start
@@ -52,7 +56,7 @@ def test_diverging_bound_solves_the_equation_of_gronwall(
     push = gain * error + disturbance
     expected = integrate(lambda e: lipschitz * e + push, start)
     found = diverging_bound(TIMES, lipschitz, disturbance, error, gain, start)
-    assert found == pytest.approx(expected, rel=1e-6, abs=1e-9)
+    assert found == pytest.approx(expected, rel=1e-5, abs=1e-9)
 
 
 def test_diverging_bound_grows_where_the_tube_settles():
@@ -73,8 +77,12 @@ def test_certified_tube_has_the_rate_and_condition_of_the_metric(metric):
     expected *= np.sqrt(values.max() / values.min())
     assert tube.steady_radius == pytest.approx(expected, rel=1e-4)
     assert tube.radius(0.0) == 0.0
-    # Theorem 2: chi bounds the condition number (of a metric whose units are not scaled).
-    assert tube.condition <= metric.condition_bound * (1 + 1e-6)
+
+
+def test_chi_bounds_the_condition_of_the_tube_in_unscaled_states(constant_metric):
+    assert np.all(constant_metric.scaling == 1.0)
+    tube = certified_tube(constant_metric, 0.3)
+    assert tube.condition == pytest.approx(constant_metric.condition_bound, rel=1e-4)
 
 
 @pytest.mark.parametrize(
