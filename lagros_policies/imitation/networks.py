@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from lagros_policies.files import write_atomic
 Float32Array = NDArray[np.float32]
 
 _FORMAT = "lagros-mlp-1"
+_CHECKSUM = "sha256"
 
 
 class Mlp:
@@ -39,8 +42,8 @@ class Mlp:
         """Copy the layers to float32 and allocate the buffers of a single evaluation."""
         if not weights or len(weights) != len(biases):
             raise ValueError(f"{len(weights)} weight matrices need as many biases")
-        self.weights = [np.ascontiguousarray(weight, np.float32) for weight in weights]
-        self.biases = [np.ascontiguousarray(bias, np.float32) for bias in biases]
+        self.weights = [np.array(weight, np.float32, order="C") for weight in weights]
+        self.biases = [np.array(bias, np.float32, order="C") for bias in biases]
         self.metadata = dict(metadata or {})
         width = self.weights[0].shape[0] if self.weights[0].ndim == 2 else -1
         for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
@@ -115,22 +118,27 @@ class Mlp:
             raise ValueError(
                 f"{path} is not a network of this package: its metadata say {metadata!r}"
             )
-        count = len(tensors) // 2
+        layers = range(len(tensors) // 2)
+        names = [f"layer{index}.{part}" for index in layers for part in ("weight", "bias")]
+        if sorted(names) != sorted(tensors):
+            raise ValueError(f"{path} holds the tensors {sorted(tensors)}, which are no layers")
         try:
-            weights = [tensors[f"layer{index}.weight"] for index in range(count)]
-            biases = [tensors[f"layer{index}.bias"] for index in range(count)]
-        except KeyError as error:
-            raise ValueError(f"{path} lacks the tensor {error}") from error
-        return cls(weights, biases, metadata)
+            return cls(
+                [tensors[name] for name in names[0::2]],
+                [tensors[name] for name in names[1::2]],
+                metadata,
+            )
+        except ValueError as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
 
 
 def write_safetensors(
     path: Path | str, tensors: dict[str, Float32Array], metadata: dict[str, str]
 ) -> None:
-    """Write tensors and metadata, whole or not at all."""
+    """Write tensors, metadata and their checksum, whole or not at all."""
     from safetensors.numpy import save
 
-    write_atomic(path, save(tensors, metadata))
+    write_atomic(path, save(tensors, {**metadata, _CHECKSUM: _checksum(tensors, metadata)}))
 
 
 def read_safetensors(path: Path | str) -> tuple[dict[str, Float32Array], dict[str, str]]:
@@ -138,7 +146,7 @@ def read_safetensors(path: Path | str) -> tuple[dict[str, Float32Array], dict[st
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is truncated or not safetensors.
+        ValueError: The file is truncated, not safetensors, or not as it was written.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -152,4 +160,16 @@ def read_safetensors(path: Path | str) -> tuple[dict[str, Float32Array], dict[st
         raise ValueError(
             f"{path} is damaged or not a safetensors file ({error}); fetch or train it again"
         ) from error
+    # The format itself does not notice a changed weight.
+    stated = metadata.pop(_CHECKSUM, None)
+    if stated is not None and stated != _checksum(tensors, metadata):
+        raise ValueError(f"{path} is damaged: its checksum is wrong; fetch or train it again")
     return tensors, metadata
+
+
+def _checksum(tensors: dict[str, Float32Array], metadata: dict[str, str]) -> str:
+    digest = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tensor.shape}".encode())
+        digest.update(tensor.tobytes())
+    return digest.hexdigest()

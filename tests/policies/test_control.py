@@ -195,6 +195,33 @@ def test_held_control_is_the_least_that_meets_its_condition(metric, system, orac
         assert condition(deviation) <= 1e-7 * energy
 
 
+@given(triples, st.floats(-60.0, 60.0))
+def test_held_control_takes_the_contracting_control_nearest_to_the_preferred_one(
+    metric, system, oracle, drawn, preferred
+):
+    state, nominal, nominal_control = as_triple(drawn)
+    energy = oracle.energy(metric, state, nominal)
+    assume(energy > 1e-4)
+    condition = held_condition(oracle, metric, 0.5, state, nominal, nominal_control)
+    lowest = scipy.optimize.minimize_scalar(condition, options={"xtol": 1e-12})
+    assume(lowest.fun < -1e-4 * energy)
+    control = held(system, metric, 0.5)(state, nominal, nominal_control, preferred)
+    deviation = float((control - nominal_control)[0])
+    assert condition(deviation) <= 1e-7 * energy
+    if condition(preferred) < -1e-6 * energy:
+        assert deviation == pytest.approx(preferred)
+    elif condition(preferred) > 1e-6 * energy:
+        # Between the bottom and the preferred control lies the edge that is nearest to it.
+        edge = scipy.optimize.brentq(condition, lowest.x, preferred, xtol=1e-11)
+        assert deviation == pytest.approx(edge, rel=1e-5, abs=1e-5)
+
+
+def test_rates_that_the_metric_does_not_promise_are_refused(metric, system):
+    for rate in (0.0, -0.5, 0.51, float("nan")):
+        with pytest.raises(ValueError, match="rate"):
+            HeldControl(system, metric, rate, PERIOD)
+
+
 def test_every_branch_of_the_held_control_occurs(metric, system, oracle, samples):
     # The property above says little if the drawn states never reach a branch.
     found = set()
