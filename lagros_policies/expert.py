@@ -104,4 +104,7 @@ class CartPoleExpert:
         preferred = preferred_deviation(
             self.feedback, plans.gains, plan, index, state - nominal, time, period
         )
+        if len(state) == 1:
+            # One state alone is integrated in plain floats.
+            return self.law(state[0], nominal[0], nominal_control[0], preferred[0])[None]
         return self.law(state, nominal, nominal_control, preferred)

@@ -153,6 +153,9 @@ def bench(
         int, typer.Option(help="Worker processes; Δt is then measured in a serial pass after.")
     ] = 1,
     timing_episodes: Annotated[int, typer.Option(help="Episodes of that pass.")] = 10,
+    replan_every: Annotated[
+        int, typer.Option(help="Control steps between the plans of tube-mpc.")
+    ] = 1,
     json: Annotated[Path | None, _file("All figures, one object per policy and condition.")] = None,
     csv: Annotated[Path | None, _file("The scalar figures.")] = None,
     latex: Annotated[Path | None, _file("The table, for LaTeX with booktabs.")] = None,
@@ -167,9 +170,12 @@ def bench(
 
     outputs = Outputs(json, csv, latex, figure, episodes_file)
     try:
+        names = listed(policies, str, "--policies")
+        planner = {"tube-mpc": {"replan_every": replan_every}} if "tube-mpc" in names else {}
         settings = BenchmarkSettings(
             task=task,
-            policies=listed(policies, str, "--policies"),
+            policies=names,
+            policy_settings=planner,
             episodes=episodes,
             seed=seed,
             disturbances=listed(disturbance, str, "--disturbance"),

@@ -5,7 +5,7 @@
 """
 
 from lagros_envs.dynamics.cartpole import CartPole
-from lagros_envs.dynamics.integrate import hold_step, linearise_hold
+from lagros_envs.dynamics.integrate import hold_control_slope, hold_step, linearise_hold
 from lagros_envs.dynamics.system import (
     Components,
     Functions,
@@ -22,6 +22,7 @@ __all__ = [
     "Functions",
     "System",
     "control_matrix",
+    "hold_control_slope",
     "hold_step",
     "jacobian",
     "linearise_hold",

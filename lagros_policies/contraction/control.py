@@ -7,7 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import System, control_matrix, hold_step, linearise_hold, vector_field
+from lagros_envs.dynamics import (
+    System,
+    control_matrix,
+    hold_control_slope,
+    hold_step,
+    vector_field,
+)
 from lagros_policies.contraction.metric import Metric
 
 FloatArray = NDArray[np.float64]
@@ -131,10 +137,9 @@ class HeldControl:
         self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return a, b, c, each (...): the condition reads a v^2 + 2 b v + c <= 0."""
-        following, _, slope = linearise_hold(self.system, state, nominal_control, self.period)
+        following, gain = hold_control_slope(self.system, state, nominal_control, self.period)
         error = following - hold_step(self.system, nominal, nominal_control, self.period)
         matrix = self.metric.matrix(following)
-        gain = slope[..., 0]
         pull = np.einsum("...ij,...j->...i", matrix, gain)
         a: FloatArray = np.einsum("...i,...i->...", gain, pull)
         b: FloatArray = np.einsum("...i,...i->...", error, pull)

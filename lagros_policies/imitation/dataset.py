@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -132,7 +133,7 @@ def generate(
         All samples, in an order that does not depend on the processes.
 
     Raises:
-        ValueError: The folder holds data of other settings.
+        ValueError: The folder holds data of other settings, or a shard is damaged.
     """
     import joblib
 
@@ -272,8 +273,13 @@ def _write_shard(
 def _gather(paths: list[Path]) -> ExpertData:
     shards = []
     for path in paths:
-        with np.load(path, allow_pickle=False) as file:
-            shards.append({name: file[name] for name in file.files})
+        try:
+            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+                shards.append({name: file[name] for name in file.files})
+        except (zipfile.BadZipFile, EOFError, ValueError) as error:
+            raise ValueError(
+                f"{path} is damaged ({error}); remove it, and it is made again"
+            ) from error
     offset = 0
     for shard in shards:
         shard["plan"] = shard["plan"] + offset
@@ -292,9 +298,13 @@ def _claim(
     task_settings: task.CartPoleSettings,
 ) -> None:
     """Refuse to mix shards of different settings in one folder."""
-    digest = hashlib.sha256(metric.coefficients.tobytes()).hexdigest()
+    law = {
+        "coefficients": hashlib.sha256(metric.coefficients.tobytes()).hexdigest(),
+        "alpha": metric.contraction_rate,
+        "region": asdict(metric.region),
+    }
     record = json.loads(
-        json.dumps({"data": asdict(settings), "task": asdict(task_settings), "metric": digest})
+        json.dumps({"data": asdict(settings), "task": asdict(task_settings), "metric": law})
     )
     manifest = folder / "manifest.json"
     if manifest.exists():

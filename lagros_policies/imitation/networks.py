@@ -135,10 +135,18 @@ class Mlp:
 def write_safetensors(
     path: Path | str, tensors: dict[str, Float32Array], metadata: dict[str, str]
 ) -> None:
-    """Write tensors, metadata and their checksum, whole or not at all."""
+    """Write tensors, metadata and their checksum, whole or not at all; equal ones, equal files."""
     from safetensors.numpy import save
 
-    write_atomic(path, save(tensors, {**metadata, _CHECKSUM: _checksum(tensors, metadata)}))
+    data = save(tensors, {**metadata, _CHECKSUM: _checksum(tensors, metadata)})
+    # The library writes the metadata in random order. A file is the length of its JSON header in
+    # eight bytes, the header, padded to a multiple of eight, and the tensors.
+    end = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    write_atomic(path, len(text).to_bytes(8, "little") + text + data[end:])
 
 
 def read_safetensors(path: Path | str) -> tuple[dict[str, Float32Array], dict[str, str]]:

@@ -1,0 +1,193 @@
+"""Training: it learns, it is repeatable, and an interruption leaves no trace."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lagros_policies.imitation.networks import Mlp, read_safetensors
+from lagros_policies.imitation.train import TrainingSettings, fit, learning_error
+
+SETTINGS = TrainingSettings(
+    hidden=(12, 12), epochs=9, batch=64, learning_rate=1e-2, checkpoint_every=2, seed=3
+)
+
+
+@pytest.fixture(scope="module")
+def data():
+    """Return a smooth function of three inputs on very different scales, and its values."""
+    rng = np.random.default_rng(0)
+    features = rng.uniform(-1.0, 1.0, (600, 3)) * [100.0, 1.0, 0.01] + [50.0, 0.0, 3.0]
+    labels = 40.0 * np.sin(3.0 * features[:, 1:2]) + 0.3 * features[:, :1] + 7.0
+    return features.astype(np.float32), labels.astype(np.float32)
+
+
+class StopHereError(Exception):
+    pass
+
+
+def interrupt_after(epoch):
+    def on_epoch(done, loss):
+        if done == epoch:
+            raise StopHereError
+
+    return on_epoch
+
+
+def same(one, other):
+    return all(
+        np.array_equal(mine, theirs)
+        for mine, theirs in zip(one.weights + one.biases, other.weights + other.biases, strict=True)
+    )
+
+
+def test_it_learns_a_function_on_any_scale(data, tmp_path):
+    features, labels = data
+    losses = []
+    settings = replace(SETTINGS, epochs=80)
+    network = fit(features, labels, settings, tmp_path / "run", lambda _, loss: losses.append(loss))
+    error = np.abs(network(features) - labels).mean()
+    assert error < 0.05 * labels.std()
+    assert len(losses) == 80
+    assert losses[-1] < 0.1 * losses[0]
+    assert (network.inputs, network.outputs) == (3, 1)
+    assert [weight.shape for weight in network.weights] == [(3, 12), (12, 12), (12, 1)]
+
+
+def test_a_constant_input_does_no_harm(data, tmp_path):
+    features, labels = data
+    features = np.column_stack([features, np.full(len(features), 4.0, np.float32)])
+    network = fit(features, labels, SETTINGS, tmp_path / "run")
+    assert np.all(np.isfinite(network(features)))
+
+
+def test_several_outputs_are_fitted(data, tmp_path):
+    features, labels = data
+    both = np.column_stack([labels, -2.0 * labels + 1.0])
+    settings = replace(SETTINGS, epochs=80)
+    network = fit(features, both, settings, tmp_path / "run")
+    assert np.abs(network(features) - both).mean(0) == pytest.approx([0.0, 0.0], abs=3.0)
+
+
+def test_same_seed_same_weights_and_other_seed_others(data, tmp_path):
+    first = fit(*data, SETTINGS, tmp_path / "a")
+    torch.manual_seed(99)
+    assert same(first, fit(*data, SETTINGS, tmp_path / "b"))
+    assert not same(first, fit(*data, replace(SETTINGS, seed=4), tmp_path / "c"))
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+@pytest.mark.parametrize("epoch", [1, 5, 6, 8, 9])
+def test_interrupted_training_ends_with_the_same_weights(data, tmp_path, epoch):
+    whole = fit(*data, SETTINGS, tmp_path / "whole")
+    with pytest.raises(StopHereError):
+        fit(*data, SETTINGS, tmp_path / "cut", interrupt_after(epoch))
+    epochs = []
+    resumed = fit(*data, SETTINGS, tmp_path / "cut", lambda done, _: epochs.append(done))
+    assert same(resumed, whole)
+    # It did go on from the last checkpoint: every second epoch, and the last.
+    saved = 9 if epoch == 9 else epoch // 2 * 2
+    assert epochs == list(range(saved + 1, 10))
+    assert [child.name for child in tmp_path.glob("cut*")] == ["cut"]
+
+
+def test_training_interrupted_twice_ends_with_the_same_weights(data, tmp_path):
+    whole = fit(*data, SETTINGS, tmp_path / "whole")
+    for epoch in (3, 7):
+        with pytest.raises(StopHereError):
+            fit(*data, SETTINGS, tmp_path / "cut", interrupt_after(epoch))
+    assert same(fit(*data, SETTINGS, tmp_path / "cut"), whole)
+
+
+def test_finished_training_is_not_repeated(data, tmp_path):
+    first = fit(*data, SETTINGS, tmp_path / "run")
+    before = (tmp_path / "run").stat().st_mtime_ns
+    epochs = []
+    assert same(fit(*data, SETTINGS, tmp_path / "run", lambda done, _: epochs.append(done)), first)
+    assert epochs == []
+    assert (tmp_path / "run").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    "other",
+    [{"epochs": 10}, {"seed": 4}, {"hidden": (12, 13)}, {"batch": 32}, {"learning_rate": 2e-3}],
+    ids=lambda change: next(iter(change)),
+)
+def test_checkpoint_of_other_settings_is_refused(data, tmp_path, other):
+    fit(*data, SETTINGS, tmp_path / "run")
+    with pytest.raises(ValueError, match="run"):
+        fit(*data, replace(SETTINGS, **other), tmp_path / "run")
+
+
+@pytest.mark.parametrize("part", ["features", "labels", "order", "number"])
+def test_checkpoint_of_other_data_is_refused(data, tmp_path, part):
+    features, labels = (array.copy() for array in data)
+    fit(features, labels, SETTINGS, tmp_path / "run")
+    if part == "features":
+        features[5, 1] += 0.25
+    elif part == "labels":
+        labels[5] += 0.25
+    elif part == "order":
+        labels = labels[::-1].copy()
+    else:
+        features, labels = features[:-1], labels[:-1]
+    with pytest.raises(ValueError, match="run"):
+        fit(features, labels, SETTINGS, tmp_path / "run")
+
+
+def test_damaged_checkpoint_is_refused_by_name(data, tmp_path):
+    with pytest.raises(StopHereError):
+        fit(*data, SETTINGS, tmp_path / "run", interrupt_after(5))
+    content = (tmp_path / "run").read_bytes()
+    for damaged in (content[:-7], b"", b"x" * 300):
+        (tmp_path / "run").write_bytes(damaged)
+        with pytest.raises(ValueError, match="run"):
+            fit(*data, SETTINGS, tmp_path / "run")
+
+
+def test_checkpoint_holds_numbers_and_no_code(data, tmp_path):
+    fit(*data, SETTINGS, tmp_path / "run")
+    tensors, metadata = read_safetensors(tmp_path / "run")
+    assert tensors
+    assert all(isinstance(value, str) for value in metadata.values())
+
+
+def test_threads_of_torch_are_left_as_they_were(data, tmp_path):
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with pytest.raises(StopHereError):
+            fit(*data, SETTINGS, tmp_path / "run", interrupt_after(1))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_learning_error_is_measured_sample_by_sample():
+    # The network is zero, so that the error is the norm of the label.
+    network = Mlp([np.zeros((2, 2))], [np.zeros(2)])
+    labels = np.array([[3.0, 4.0]] * 99 + [[30.0, 40.0]], np.float32)
+    error = learning_error(network, np.zeros((100, 2), np.float32), labels)
+    assert error.samples == 100
+    assert error.mean == pytest.approx((99 * 5.0 + 50.0) / 100)
+    assert error.maximum == pytest.approx(50.0)
+    assert 5.0 <= error.p99 <= 50.0
+    assert error.p99 == pytest.approx(np.quantile([5.0] * 99 + [50.0], 0.99))
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"hidden": ()},
+        {"hidden": (10, 0)},
+        {"epochs": 0},
+        {"batch": 0},
+        {"held_out": 1.0},
+        {"learning_rate": 0.0},
+        {"checkpoint_every": 0},
+    ],
+)
+def test_settings_out_of_range_are_refused(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        TrainingSettings(**bad)
