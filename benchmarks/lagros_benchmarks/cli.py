@@ -171,7 +171,7 @@ def bench(
     outputs = Outputs(json, csv, latex, figure, episodes_file)
     try:
         names = listed(policies, str, "--policies")
-        planner = {"tube-mpc": {"replan_every": replan_every}} if "tube-mpc" in names else {}
+        planner = {"tube-mpc": {"replan_every": replan_every}} if replan_every != 1 else {}
         settings = BenchmarkSettings(
             task=task,
             policies=names,

@@ -1,0 +1,1 @@
+"""Micro-benchmarks of lagros against its peers; run `python benchmarks/speed/run.py`."""
