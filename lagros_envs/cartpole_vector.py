@@ -172,7 +172,7 @@ class CartPoleVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.flo
         restarting = self._pending
         moving = ~restarting
         if restarting.any():
-            self._begin(restarting, None, {})
+            self._begin_unasked(restarting)
         self._advance(force, moving)
         distance = self._goal_distance()
         first_success = self._note_success(distance, np.ones(self.num_envs, bool))
@@ -223,6 +223,18 @@ class CartPoleVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.flo
                     f"options[{name!r}] has shape {checked[name].shape}; it must be {wanted}"
                 )
         return checked
+
+    def _begin_unasked(self, mask: BoolArray) -> None:
+        """Start the episodes of an autoreset, for which nobody has planned a nominal."""
+        if self.disturbance.kind == "worst":
+            raise ValueError(
+                'disturbance="worst" needs a nominal trajectory for every episode, and an autoreset '
+                'starts one without: use autoreset_mode="disabled" and reset with '
+                'options={"nominal": ..., "reset_mask": ...}'
+            )
+        if self.nominal is not None:
+            self.nominal = np.where(mask[:, None, None], np.nan, self.nominal)
+        self._begin(mask, None, {})
 
     def _begin(self, mask: BoolArray, seeds: list[int] | None, options: dict[str, Any]) -> None:
         """Draw scenario and disturbance of the masked worlds and put them at their start."""
@@ -277,7 +289,7 @@ class CartPoleVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.flo
     def _restart_now(self, ended: BoolArray, info: dict[str, Any]) -> dict[str, Any]:
         final_observation = self._observation()
         final_info = {key: value.copy() for key, value in info.items()}
-        self._begin(ended, None, {})
+        self._begin_unasked(ended)
         distance = self._goal_distance()
         self._note_success(distance, ended)
         info = self._info(distance)

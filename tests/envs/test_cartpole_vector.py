@@ -465,3 +465,25 @@ def test_gymnasiums_wrappers_for_vector_environments_run(hold):
         total += rewards
     assert truncated.all()
     np.testing.assert_allclose(info["episode"]["r"], total)
+
+
+def test_an_autoreset_forgets_the_nominal_of_the_last_episode():
+    env = CartPoleVectorEnv(num_envs=2, autoreset_mode="next_step")
+    nominal = np.zeros((2, env.settings.steps + 1, 4))
+    env.reset(seed=[3, 4], options={"nominal": nominal})
+    still = np.zeros((2, 1), np.float32)
+    ended = np.zeros(2, bool)
+    while not ended.any():
+        _, _, terminated, truncated, info = env.step(still)
+        assert np.all(np.isfinite(info["tracking_error"]))
+        ended = terminated | truncated
+    _, _, _, _, info = env.step(still)
+    assert np.all(np.isnan(info["tracking_error"]) == ended)
+
+
+def test_worst_says_that_an_autoreset_has_no_nominal():
+    env = CartPoleVectorEnv(num_envs=1, disturbance="worst", metric=np.eye(4))
+    env.reset(seed=0, options={"nominal": np.zeros((1, env.settings.steps + 1, 4))})
+    with pytest.raises(ValueError, match="autoreset_mode"):
+        for _ in range(env.settings.steps + 1):
+            env.step(np.zeros((1, 1), np.float32))
