@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 from collections.abc import Callable
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
@@ -50,8 +51,10 @@ def make(name: str, env: gym.Env[Any, Any], **settings: Any) -> Policy:
     """Build a policy for an environment.
 
     Args:
-        name: One of `NAMES`, or the path of a stable-baselines3 model (a zip file). Such a file
-            holds pickled code: loading it runs it, so load only what you trust.
+        name: One of `NAMES`; the path of a stable-baselines3 model (`ppo.zip`, `sac:model.zip`);
+            or `module:Class`, a class of your own that is built with the task's settings. A zip of
+            stable-baselines3 holds pickled code and a module is code: both run, so name only what
+            you trust.
         env: The environment; the policy takes its task settings and nothing else.
         settings: Passed to the policy, e.g. `weights=path` or `metric=...`.
 
@@ -67,17 +70,30 @@ def make(name: str, env: gym.Env[Any, Any], **settings: Any) -> Policy:
         raise TypeError(f"there are no policies for {env}; use an environment of lagros_envs")
     if name in NAMES:
         return _builders()[name](task, **settings)
-    if name.endswith(".zip") or ":" in name:
+    if name.endswith(".zip"):
         from lagros_policies.baselines import load_stable_baselines3
 
         algorithm, _, path = name.rpartition(":")
         return load_stable_baselines3(path, algorithm or None, **settings)
+    if ":" in name:
+        return _own_policy(name)(task, **settings)
     near = difflib.get_close_matches(name, NAMES, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     raise ValueError(
-        f"policy {name!r} is not known.{hint} Use one of {', '.join(NAMES)}, or the path of a "
-        "stable-baselines3 zip"
+        f"policy {name!r} is not known.{hint} Use one of {', '.join(NAMES)}, the path of a "
+        "stable-baselines3 zip, or module:Class"
     )
+
+
+def _own_policy(name: str) -> Callable[..., Policy]:
+    module, _, attribute = name.partition(":")
+    try:
+        return cast("Callable[..., Policy]", getattr(importlib.import_module(module), attribute))
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"policy {name!r}: {error}; module:Class must name a class that Python can import from "
+            "here"
+        ) from error
 
 
 def _builders() -> dict[str, Callable[..., Policy]]:

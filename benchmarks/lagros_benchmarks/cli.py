@@ -6,6 +6,8 @@ inside it, so that `lagros --help` answers at once.
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -130,7 +132,8 @@ def bench(
         str,
         typer.Option(
             metavar="NAME[,NAME]",
-            help="Of learned, tube-mpc, lagros, lqr, random, ppo, or a stable-baselines3 .zip.",
+            help="Of learned, tube-mpc, lagros, lqr, random, ppo, a stable-baselines3 .zip, or "
+            "module:Class.",
         ),
     ] = "learned,tube-mpc,lagros,lqr",
     episodes: Annotated[int, typer.Option(help="Episodes of each policy and condition.")] = 50,
@@ -169,6 +172,8 @@ def bench(
     from lagros_benchmarks.settings import BenchmarkSettings, check_policy
 
     outputs = Outputs(json, csv, latex, figure, episodes_file)
+    # A policy of the user's own, module:Class, lies in the folder that lagros is run from.
+    sys.path.insert(0, os.getcwd())
     try:
         names = listed(policies, str, "--policies")
         planner = {"tube-mpc": {"replan_every": replan_every}} if replan_every != 1 else {}

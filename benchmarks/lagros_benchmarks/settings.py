@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib.util
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -39,7 +40,7 @@ def unknown_name(what: str, given: str, valid: Iterable[str], note: str = "") ->
 
 
 def check_policy(name: str) -> None:
-    """Check that a policy is a known name or an existing file.
+    """Check that a policy is a known name, an existing file or an importable module.
 
     Raises:
         ValueError: It is neither.
@@ -55,8 +56,15 @@ def check_policy(name: str) -> None:
         if path.is_file():
             return
         raise ValueError(f"there is no file {str(path)!r} for a policy")
+    module, colon, _ = name.partition(":")
+    if colon:
+        if importlib.util.find_spec(module) is None:
+            raise ValueError(f"there is no module {module!r} for the policy {name!r}")
+        return
     raise ValueError(
-        unknown_name("policy", name, names, ", or the .zip of a stable-baselines3 model")
+        unknown_name(
+            "policy", name, names, ", the .zip of a stable-baselines3 model, or module:Class"
+        )
     )
 
 

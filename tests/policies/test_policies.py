@@ -246,3 +246,18 @@ def test_observation_layout_is_that_of_the_task(observations):
     assert (slice(0, 4), slice(4, 8), slice(8, 12)) == (task.STATE, task.GOAL, task.INITIAL_STATE)
     assert task.TIME == 12
     assert observations.shape[1] == task.OBSERVATION_DIM
+
+
+def test_make_builds_a_class_of_the_users_own(monkeypatch, tmp_path):
+    (tmp_path / "own_policy_module.py").write_text(
+        "class Still:\n"
+        "    def __init__(self, settings):\n"
+        "        self.unit = settings.force_scale\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    env = gym.make("lagros/CartPole-v0")
+    assert lagros_policies.make("own_policy_module:Still", env).unit == 40.0
+    with pytest.raises(ValueError, match="no_such_module"):
+        lagros_policies.make("no_such_module:Still", env)
+    with pytest.raises(ValueError, match="Moving"):
+        lagros_policies.make("own_policy_module:Moving", env)
