@@ -14,6 +14,7 @@ def saved(metric, tmp_path):
     """Return a metric with awkward numbers in every field, and its file."""
     checked = replace(
         metric,
+        contraction_rate=1.0 / 3.0,
         scaling=np.array([1.0, 1.0 / 3.0, np.pi, 0.1]),
         verification=Verification(samples=10_000, violations=3, worst=-0.1 / 3.0, seed=2**63 + 11),
     )

@@ -216,6 +216,17 @@ def test_impossible_problem_is_reported_and_not_raised():
     assert plan.status
 
 
+def test_plan_counts_as_solved_only_where_its_defect_is_small():
+    # However large the last step may be: the defects are what a plan is accepted by.
+    for tolerance in (1e-3, 1e-9):
+        scp = ScpSettings(step_tolerance=100.0, defect_tolerance=tolerance)
+        planner = CartPolePlanner(settings=CartPolePlannerSettings(scp=scp))
+        plan = planner.plan(start_at(1.0), goal_at(5.0))
+        assert plan.solved
+        assert plan.defect <= tolerance
+    assert plan.iterations > 1
+
+
 def test_iterations_end_and_say_so():
     planner = CartPolePlanner(settings=CartPolePlannerSettings(scp=ScpSettings(max_iterations=1)))
     plan = planner.plan(start_at(1.0), goal_at(5.0))

@@ -256,8 +256,8 @@ def test_make_builds_a_class_of_the_users_own(monkeypatch, tmp_path):
     )
     monkeypatch.syspath_prepend(tmp_path)
     env = gym.make("lagros/CartPole-v0")
-    assert lagros_policies.make("own_policy_module:Still", env).unit == 40.0
+    assert make("own_policy_module:Still", env).unit == 40.0
     with pytest.raises(ValueError, match="no_such_module"):
-        lagros_policies.make("no_such_module:Still", env)
+        make("no_such_module:Still", env)
     with pytest.raises(ValueError, match="Moving"):
-        lagros_policies.make("own_policy_module:Moving", env)
+        make("own_policy_module:Moving", env)
