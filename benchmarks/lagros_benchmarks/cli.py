@@ -48,6 +48,7 @@ class Outputs:
         json: All figures of the run, a list with one object per policy and condition.
         csv: The scalar ones.
         latex: The table.
+        markdown: The table; success by condition if there are several.
         figure: The error figure of one condition, or the success figure of several.
         episodes: Every episode, one JSON object a line.
     """
@@ -55,6 +56,7 @@ class Outputs:
     json: Path | None = None
     csv: Path | None = None
     latex: Path | None = None
+    markdown: Path | None = None
     figure: Path | None = None
     episodes: Path | None = None
 
@@ -68,7 +70,7 @@ class Outputs:
             from lagros_benchmarks.figures import check_figure_path
 
             check_figure_path(self.figure)
-        for path in (self.json, self.csv, self.latex, self.figure, self.episodes):
+        for path in (self.json, self.csv, self.latex, self.markdown, self.figure, self.episodes):
             if path is None:
                 continue
             try:
@@ -86,6 +88,8 @@ class Outputs:
             yield files.write_atomic(self.csv, tables.csv_text(rows))
         if self.latex is not None:
             yield files.write_atomic(self.latex, tables.latex_text(rows))
+        if self.markdown is not None:
+            yield files.write_atomic(self.markdown, tables.markdown_text(rows))
         if self.episodes is not None:
             yield files.write_json_lines(self.episodes, records.episode_objects(run))
         if self.figure is not None:
@@ -162,6 +166,7 @@ def bench(
     json: Annotated[Path | None, _file("All figures, one object per policy and condition.")] = None,
     csv: Annotated[Path | None, _file("The scalar figures.")] = None,
     latex: Annotated[Path | None, _file("The table, for LaTeX with booktabs.")] = None,
+    markdown: Annotated[Path | None, _file("The table, as Markdown.")] = None,
     figure: Annotated[
         Path | None,
         _file("Error over time; success against the bound if there are several conditions."),
@@ -171,7 +176,7 @@ def bench(
     """Compare policies on the same episodes; print the table, write what is asked for."""
     from lagros_benchmarks.settings import BenchmarkSettings, check_policy
 
-    outputs = Outputs(json, csv, latex, figure, episodes_file)
+    outputs = Outputs(json, csv, latex, markdown, figure, episodes_file)
     # A policy of the user's own, module:Class, lies in the folder that lagros is run from.
     sys.path.insert(0, os.getcwd())
     try:

@@ -233,6 +233,44 @@ def latex_text(rows: Sequence[Row]) -> str:
     return "\n".join(blocks) + "\n"
 
 
+def markdown_text(rows: Sequence[Row]) -> str:
+    """Return Markdown tables: one per condition, or success by condition where there are many."""
+    groups = by_condition(rows)
+    blocks = [f"    {' '.join(rows[0]['command'].split())}"] if rows else []
+    if len(groups) > 1:
+        return "\n\n".join([*blocks, _success_grid(groups)]) + "\n"
+    for group in groups:
+        units = [f"{heading} [{unit}]" if unit else heading for heading, unit, _ in _COLUMNS]
+        contents = [[content(row) for _, _, content in _COLUMNS] for row in group]
+        blocks.append(_markdown(units, contents))
+        heading, *lines = [*comparison_lines(group)] or [""]
+        if lines:
+            blocks += [heading, "\n".join(f"- {line.strip()}" for line in lines)]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _success_grid(groups: Sequence[Sequence[Row]]) -> str:
+    """Success of every policy under every condition, and (c) minus (b) on the same episodes."""
+    policies = [row["policy"] for row in groups[0]]
+    paired = {"lagros", "tube-mpc"} <= set(policies)
+    headings = ["disturbance", "d̄", *(f"{policy_label(name)} [%]" for name in policies)]
+    contents = []
+    for group in groups:
+        line = [group[0]["disturbance"], f"{group[0]['bound']:g}"]
+        line += [percent(row["success_rate"]) for row in group]
+        if paired:
+            ours = next(row for row in group if row["policy"] == "lagros")
+            change = ours["versus"]["tube-mpc"]["success_difference"]
+            line.append(f"{100 * change:+.1f}")
+        contents.append(line)
+    return _markdown([*headings, "(c) − (b) [points]"] if paired else headings, contents)
+
+
+def _markdown(headings: Sequence[str], contents: Sequence[Sequence[str]]) -> str:
+    rule = ["---", *["---:"] * (len(headings) - 1)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (headings, rule, *contents))
+
+
 def _escape(text: str) -> str:
     for plain, latex in _LATEX.items():
         text = text.replace(plain, latex)

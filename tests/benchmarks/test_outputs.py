@@ -199,3 +199,19 @@ def test_known_policies_always_look_the_same_and_all_differ():
     found = figures.styles(names)
     assert found["lagros"] == figures.styles(["lagros"])["lagros"]
     assert len({(style.colour, str(style.line)) for style in found.values()}) == len(names)
+
+
+def test_markdown_is_one_table_with_the_paired_differences(rows):
+    lines = tables.markdown_text(rows).splitlines()
+    cells = [line.split("|") for line in lines if line.startswith("|")]
+    assert len(cells) == 2 + len(POLICIES)
+    assert len({len(line) for line in cells}) == 1
+    assert sum(line.startswith("- ") for line in lines) == len(POLICIES) - 1
+    assert tables.markdown_text(rows[:1]).count("|") > 0
+
+
+def test_markdown_of_many_conditions_is_the_success_of_each(grid_rows):
+    lines = [line for line in tables.markdown_text(grid_rows).splitlines() if "|" in line]
+    conditions = {(row["disturbance"], row["bound"]) for row in grid_rows}
+    assert len(lines) == 2 + len(conditions)
+    assert f"{100 * grid_rows[0]['success_rate']:.1f}" in lines[2]

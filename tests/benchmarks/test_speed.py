@@ -9,7 +9,7 @@ from rich.console import Console
 from speed import environment, network, planner, report, sdp, timing
 
 TINY = timing.Scale(
-    steps=25,
+    steps=20,
     plans=2,
     episodes=2,
     samples=(3,),
