@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from lagros_policies.files import write_atomic
+from lagros_envs.files import write_atomic
+
+__all__ = ["plain", "write_atomic", "write_json", "write_json_lines"]
 
 
 def plain(value: Any) -> Any:

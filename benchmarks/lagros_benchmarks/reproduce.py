@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from lagros_benchmarks.runner import Progress
 from lagros_benchmarks.settings import BenchmarkSettings
 from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.files import write_atomic
 from lagros_policies.contraction import Metric, load_metric, save_metric
-from lagros_policies.files import write_atomic
 from lagros_policies.imitation.dataset import ExpertData, ExpertDataSettings, generate
 from lagros_policies.imitation.features import FEATURES, cartpole_features
 from lagros_policies.imitation.networks import Mlp

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
-from lagros_policies.files import write_atomic
+from lagros_envs.files import write_atomic
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from lagros_envs import cartpole_task as task
 from lagros_envs.disturbances import OPEN_LOOP, into_unit_ball
 from lagros_envs.dynamics import hold_step
+from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_policies.contraction import Metric
 from lagros_policies.expert import CartPoleExpert, TrackedPlans
-from lagros_policies.files import write_atomic
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

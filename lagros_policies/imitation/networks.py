@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_policies.files import write_atomic
+from lagros_envs.files import write_atomic
 
 Float32Array = NDArray[np.float32]
 

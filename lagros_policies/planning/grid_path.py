@@ -1,0 +1,320 @@
+"""First guesses for the joint planner: shortest paths on a grid, and searches in space and time.
+
+Guesses need not obey any constraint. They choose the side on which an agent passes an obstacle or
+another agent, which the quadratic programs that follow cannot change. Every choice is
+deterministic; ties go to the side that leaves the obstacle on the left and to agents that keep to
+the right.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import dijkstra
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True)
+class GridSettings:
+    """The grids.
+
+    Attributes:
+        cell: Cell of the shortest paths [m].
+        border: Free room around all starts, goals and obstacles [m].
+        preference: Share by which going counter-clockwise around an obstacle is cheaper.
+        crossing_cost: How many times longer a way through an inflated obstacle counts.
+        sidestep: How far to the right of its path an agent is guessed at its middle [m].
+        search_cell: Cell of the search in space and time [m].
+        search_period: Its time step [s].
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    cell: float = 0.15
+    border: float = 1.5
+    preference: float = 0.03
+    crossing_cost: float = 30.0
+    sidestep: float = 0.05
+    search_cell: float = 0.25
+    search_period: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name}={value!r} must be finite and >= 0")
+        if not (self.cell > 0.0 and self.search_cell > 0.0 and self.search_period > 0.0):
+            raise ValueError("cell, search_cell and search_period must be > 0")
+        if self.preference >= 1.0:
+            raise ValueError(f"preference={self.preference!r} must be below 1")
+
+
+def shortest_paths(
+    starts: FloatArray,
+    goals: FloatArray,
+    obstacles: FloatArray,
+    distance: FloatArray,
+    settings: GridSettings,
+) -> list[FloatArray]:
+    """Return for each agent the shortest way around the inflated obstacles, straightened.
+
+    Where no free way exists the path crosses an obstacle: what follows will find it infeasible.
+
+    Args:
+        starts: Positions, shape (n, 2) [m].
+        goals: Positions, shape (n, 2) [m].
+        obstacles: Centres, shape (m, 2) [m].
+        distance: To be kept from each centre, shape (m,) [m].
+        settings: The grid.
+
+    Returns:
+        One polyline per agent, shape (points, 2), from its start to its goal [m].
+    """
+    origin, shape = _frame(starts, goals, obstacles, settings.cell, settings.border)
+    graph = _graph(origin, shape, obstacles, distance, settings)
+    sources = _nearest_cell(starts, origin, shape, settings.cell)
+    targets = _nearest_cell(goals, origin, shape, settings.cell)
+    _, before = dijkstra(graph, indices=sources, return_predecessors=True)
+    paths = []
+    for agent in range(len(starts)):
+        chain = [int(targets[agent])]
+        while before[agent, chain[-1]] >= 0:
+            chain.append(int(before[agent, chain[-1]]))
+        cells = np.stack(np.unravel_index(np.array(chain[::-1]), shape), axis=-1)
+        inner = origin + settings.cell * cells[1:-1]
+        path = np.vstack([starts[agent], inner, goals[agent]])
+        paths.append(straighten(path, obstacles, distance))
+    return paths
+
+
+def straighten(path: FloatArray, obstacles: FloatArray, distance: FloatArray) -> FloatArray:
+    """Drop the points of a polyline that the discs do not need.
+
+    Args:
+        path: Polyline, shape (points, 2) [m].
+        obstacles: Centres, shape (m, 2) [m].
+        distance: To be kept from each centre, shape (m,) [m]; less where the path itself is nearer.
+
+    Returns:
+        The polyline with some points left out, both ends kept.
+    """
+    gaps = np.linalg.norm(path[:, None] - obstacles, axis=-1)
+    kept = [0]
+    while kept[-1] < len(path) - 1:
+        here = kept[-1]
+        ahead = path[here + 1 :]
+        allowed = np.minimum(distance, np.minimum.accumulate(gaps[here:])[1:]) - 1e-9
+        clear = np.all(segment_distance(path[here], ahead, obstacles) >= allowed, axis=1)
+        kept.append(here + 1 + int(np.max(np.flatnonzero(clear), initial=0)))
+    return path[kept]
+
+
+def segment_distance(begin: FloatArray, end: FloatArray, points: FloatArray) -> FloatArray:
+    """Return the distances from segments to points.
+
+    Args:
+        begin: Ends of the segments, shape (..., 2).
+        end: Other ends, shape (..., 2).
+        points: Shape (m, 2).
+
+    Returns:
+        Shape (..., m).
+    """
+    along = (end - begin)[..., None, :]
+    delta = points - begin[..., None, :]
+    length = np.sum(along * along, axis=-1)
+    share = np.sum(delta * along, axis=-1) / np.where(length > 0.0, length, 1.0)
+    nearest = delta - np.clip(share, 0.0, 1.0)[..., None] * along
+    value: FloatArray = np.linalg.norm(nearest, axis=-1)
+    return value
+
+
+def walk(path: FloatArray, progress: FloatArray, sidestep: float = 0.0) -> FloatArray:
+    """Return the points of a polyline at shares of its length.
+
+    Args:
+        path: Polyline, shape (points, 2) [m].
+        progress: Shares in [0, 1], shape (k,).
+        sidestep: Shift to the right at the middle, none at the ends [m].
+
+    Returns:
+        Positions, shape (k, 2) [m].
+    """
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    total = float(length[-1])
+    share = length / total if total > 0.0 else np.linspace(0.0, 1.0, len(length))
+    points = np.stack([np.interp(progress, share, path[:, axis]) for axis in range(2)], axis=-1)
+    heading = path[-1] - path[0]
+    right = np.array([heading[1], -heading[0]]) / max(float(np.linalg.norm(heading)), 1e-9)
+    shifted: FloatArray = points + sidestep * np.sin(math.pi * progress)[:, None] * right
+    return shifted
+
+
+def smooth_progress(time: FloatArray, begin: float, end: float) -> FloatArray:
+    """Return the share of the way of least effort from rest to rest between two times.
+
+    Args:
+        time: Any shape [s].
+        begin: Departure [s].
+        end: Arrival, after the departure [s].
+    """
+    share = np.clip((time - begin) / (end - begin), 0.0, 1.0)
+    value: FloatArray = share * share * (3.0 - 2.0 * share)
+    return value
+
+
+def search_in_turn(
+    starts: FloatArray,
+    goals: FloatArray,
+    obstacles: FloatArray,
+    distance: FloatArray,
+    pair_distance: float,
+    times: FloatArray,
+    order: IntArray,
+    settings: GridSettings,
+) -> FloatArray:
+    """Guess one agent after the other, each around those before it, by search in space and time.
+
+    Dynamic programming over a coarse grid: least sum of squared steps, with a large price for
+    coming too near. Being agents in priority order, the later ones give way.
+
+    Args:
+        starts: Positions, shape (n, 2) [m].
+        goals: Positions, shape (n, 2) [m].
+        obstacles: Centres, shape (m, 2) [m].
+        distance: To be kept from each centre, shape (m,) [m].
+        pair_distance: To be kept between agents [m].
+        times: Instants of the guess, from 0, shape (k,) [s].
+        order: The agents by priority, shape (n,).
+        settings: The grid.
+
+    Returns:
+        Positions, shape (n, k, 2) [m].
+    """
+    cell, duration = settings.search_cell, float(times[-1])
+    origin, shape = _frame(starts, goals, obstacles, cell, settings.border)
+    layers = max(2, round(duration / settings.search_period))
+    centres = origin + cell * np.stack(np.indices(shape), axis=-1)
+    gaps = np.linalg.norm(centres[:, :, None] - obstacles, axis=-1) - distance
+    # Half a cell of leave: the programs that follow polish the guess.
+    static = _price(np.min(gaps, axis=-1, initial=np.inf) + 0.5 * cell)
+    sources = _nearest_cell(starts, origin, shape, cell)
+    targets = _nearest_cell(goals, origin, shape, cell)
+    instants = np.linspace(0.0, duration, layers + 1)
+    found = np.zeros((len(starts), layers + 1, 2))
+    for turn, agent in enumerate(order):
+        prices = np.repeat(static[None], layers + 1, axis=0)
+        for other in order[:turn]:
+            apart = np.linalg.norm(centres - found[other][:, None, None], axis=-1)
+            prices += _price(apart - pair_distance)
+        cells = _cheapest_chain(prices, int(sources[agent]), int(targets[agent]))
+        found[agent] = origin + cell * cells
+        found[agent, 0], found[agent, -1] = starts[agent], goals[agent]
+    return np.stack(
+        [
+            np.stack([np.interp(times, instants, found[agent, :, axis]) for axis in range(2)], -1)
+            for agent in range(len(starts))
+        ]
+    )
+
+
+_STEPS = [(i, j) for i in range(-2, 3) for j in range(-2, 3)]
+
+
+def _price(room: FloatArray) -> FloatArray:
+    """Return what standing at a distance beyond the required one costs, in squared cells."""
+    value: FloatArray = np.where(room < 0.0, 100.0 - 100.0 * room, 0.0)
+    return value
+
+
+def _cheapest_chain(prices: FloatArray, source: int, target: int) -> IntArray:
+    """Return the cells (layers, 2) from source to target of least squared steps plus prices."""
+    layers, rows, columns = prices.shape
+    value = np.full((rows, columns), np.inf)
+    value.flat[source] = 0.0
+    choice = np.zeros((layers, rows, columns), dtype=np.int8)
+    for layer in range(1, layers):
+        padded = np.pad(value, 2, constant_values=np.inf)
+        options = np.stack(
+            [
+                padded[2 - i : 2 - i + rows, 2 - j : 2 - j + columns] + float(i * i + j * j)
+                for i, j in _STEPS
+            ]
+        )
+        choice[layer] = np.argmin(options, axis=0)
+        value = np.min(options, axis=0) + prices[layer]
+    cell = np.array(np.unravel_index(target, (rows, columns)))
+    if not np.isfinite(value[tuple(cell)]):
+        # Too far for the steps of this grid: a straight line.
+        begin = np.array(np.unravel_index(source, (rows, columns)))
+        return np.rint(np.linspace(begin, cell, layers)).astype(np.intp)
+    chain = [cell]
+    for layer in range(layers - 1, 0, -1):
+        cell = cell - np.array(_STEPS[choice[(layer, *cell)]])
+        chain.append(cell)
+    return np.array(chain[::-1])
+
+
+def _frame(
+    starts: FloatArray, goals: FloatArray, obstacles: FloatArray, cell: float, border: float
+) -> tuple[FloatArray, tuple[int, int]]:
+    points = np.vstack([starts, goals, obstacles])
+    low, high = points.min(axis=0) - border, points.max(axis=0) + border
+    count = np.ceil((high - low) / cell).astype(int) + 1
+    return low, (int(count[0]), int(count[1]))
+
+
+def _nearest_cell(
+    points: FloatArray, origin: FloatArray, shape: tuple[int, int], cell: float
+) -> IntArray:
+    index = np.rint((points - origin) / cell).astype(np.intp)
+    flat: IntArray = np.ravel_multi_index((index[:, 0], index[:, 1]), shape)
+    return flat
+
+
+def _graph(
+    origin: FloatArray,
+    shape: tuple[int, int],
+    obstacles: FloatArray,
+    distance: FloatArray,
+    settings: GridSettings,
+) -> sparse.csr_matrix:
+    """Return the directed lengths between each cell and its sixteen nearest in sight."""
+    count = shape[0] * shape[1]
+    number = np.arange(count).reshape(shape)
+    centres = origin + settings.cell * np.stack(np.indices(shape), axis=-1)
+    rows, columns, lengths = [], [], []
+    for i, j in (s for s in _STEPS if math.gcd(*s) == 1):
+        here = (_overlap(i, shape[0]), _overlap(j, shape[1]))
+        there = (_overlap(-i, shape[0]), _overlap(-j, shape[1]))
+        step = settings.cell * np.array([i, j], dtype=np.float64)
+        length = float(np.linalg.norm(step))
+        offset = centres[here] + 0.5 * step
+        delta = offset[..., None, :] - obstacles
+        gap = np.linalg.norm(delta, axis=-1)
+        crosses = np.any(gap < distance, axis=-1)
+        # Counter-clockwise around the near obstacles is a little cheaper.
+        turn = delta[..., 0] * step[1] - delta[..., 1] * step[0]
+        swirl = np.sum(turn / np.maximum(gap, 1e-9) * np.exp(-gap), axis=-1) / length
+        factor = np.where(crosses, settings.crossing_cost, 1.0)
+        factor = factor * (1.0 - settings.preference * np.clip(swirl, -1.0, 1.0))
+        rows.append(number[here].ravel())
+        columns.append(number[there].ravel())
+        lengths.append((length * factor).ravel())
+    return sparse.csr_matrix(
+        (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))),
+        shape=(count, count),
+    )
+
+
+def _overlap(shift: int, size: int) -> slice:
+    """Return the cells whose neighbour at a shift lies on the grid."""
+    return slice(max(0, -shift), size - max(0, shift))

@@ -1,0 +1,416 @@
+"""Target trajectories of all spacecraft at once: the paper's centralised planner (d).
+
+Least effort never turns a body, and with opposing thrusters the effort of a force is
+||u||^2 = ||F||^2 / 2 whatever the heading (see `contraction.thrusters`). So the plan is one of
+planar double integrators with the objective 1/2 sum_i int ||F_i||^2 dt, and is exact for the
+spacecraft with their headings at rest.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_policies.planning.grid_path import (
+    GridSettings,
+    search_in_turn,
+    segment_distance,
+    shortest_paths,
+    smooth_progress,
+    walk,
+)
+from lagros_policies.planning.joint_scp import (
+    JointProblem,
+    JointScpSettings,
+    JointSolution,
+    positions_between,
+    solve_joint,
+)
+
+FloatArray = NDArray[np.float64]
+
+# Distances are planned wider by this, so that a swept check finds the margins themselves kept [m].
+_SPARE = 5e-3
+# Ordering of seeds: the restarts of one problem draw from streams of their own.
+_RESTART_SEED = 20210
+
+
+@dataclass(frozen=True, slots=True)
+class SpacecraftPlannerSettings:
+    """The problem and how hard to look for a plan.
+
+    Attributes:
+        horizon: T, duration of a whole plan [s].
+        nodes: N, node steps in T.
+        control_period: Period of the control grid; divides the node step [s].
+        mass: m of one spacecraft [kg].
+        obstacle_margin: Room beyond touching between an agent and an obstacle [m].
+        pair_margin: Room beyond touching between two agents [m].
+        margin_growth: Where a start or goal lies inside a margin, how fast the margin grows from
+            what there is, and shrinks towards the goal [m/s].
+        speed_limit: Largest speed per axis; a node step at this speed must not cross an agent and
+            its margins [m/s].
+        candidates: Solved plans among which the one of least effort is taken.
+        restarts: Guesses from time-shifted shortest paths after the first.
+        searches: Guesses by search in space and time, in priority order, after those.
+        check_period: Period of the final check, swept between its instants [s].
+        scp: How to iterate.
+        grid: How to guess.
+
+    Raises:
+        ValueError: A value is out of range or the periods do not divide each other.
+    """
+
+    horizon: float = 30.0
+    nodes: int = 60
+    control_period: float = 0.1
+    mass: float = 1.0
+    obstacle_margin: float = 0.3
+    pair_margin: float = 0.3
+    margin_growth: float = 0.05
+    speed_limit: float = 0.7
+    candidates: int = 1
+    restarts: int = 3
+    searches: int = 4
+    check_period: float = 0.05
+    scp: JointScpSettings = field(default_factory=JointScpSettings)
+    grid: GridSettings = field(default_factory=GridSettings)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name in ("horizon", "control_period", "mass", "speed_limit", "check_period"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name}={value!r} must be positive and finite")
+        for name in ("obstacle_margin", "pair_margin", "margin_growth"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name}={value!r} must be finite and >= 0")
+        if self.nodes < 2 or self.candidates < 1 or self.restarts < 0 or self.searches < 0:
+            raise ValueError("nodes must be >= 2, candidates >= 1, restarts and searches >= 0")
+        divisor("control_period", self.control_period, self.node_period)
+        divisor("check_period", self.check_period, self.node_period)
+
+    @property
+    def node_period(self) -> float:
+        """Time from node to node [s]."""
+        return self.horizon / self.nodes
+
+
+@dataclass(frozen=True)
+class JointPlan:
+    """Target trajectories of all agents.
+
+    Attributes:
+        states: [p, v] at the nodes, shape (n, N + 1, 4) [m, m/s].
+        forces: F in the world's frame, held between nodes, shape (n, N, 2) [N].
+        node_period: Time from node to node [s].
+        mass: m [kg].
+        solved: Whether ends, margins and speeds are kept, between the nodes too.
+        status: How the plan was found, or why there is none, in words.
+        clearance: Least room beyond touching, swept between control instants [m]; inf for one
+            agent without obstacles.
+        iterations: Quadratic programs solved, over all guesses.
+        attempts: Guesses tried.
+        seconds: Wall time [s].
+    """
+
+    states: FloatArray
+    forces: FloatArray
+    node_period: float
+    mass: float
+    solved: bool
+    status: str
+    clearance: float
+    iterations: int
+    attempts: int
+    seconds: float
+
+    @property
+    def effort(self) -> FloatArray:
+        """The integral of ||u_d||^2 = ||F||^2 / 2 per agent, shape (n,) [N^2 s]."""
+        value: FloatArray = 0.5 * self.node_period * np.sum(self.forces**2, axis=(1, 2))
+        return value
+
+    def resample(self, period: float) -> tuple[FloatArray, FloatArray]:
+        """Return the same motion on a finer grid, exactly.
+
+        Args:
+            period: Divides the node step [s].
+
+        Returns:
+            [p, v], shape (n, K + 1, 4), and F held from instant to instant, shape (n, K, 2).
+
+        Raises:
+            ValueError: The period does not divide the node step.
+        """
+        count = divisor("period", period, self.node_period)
+        place, speed = positions_between(
+            self.states, self.forces, self.mass, self.node_period, count
+        )
+        return np.concatenate([place, speed], axis=-1), np.repeat(self.forces, count, axis=1)
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """The arrays of one call, checked."""
+
+    starts: FloatArray  # (n, 4)
+    goals: FloatArray  # (n, 4)
+    obstacles: FloatArray  # (m, 2)
+    touching: FloatArray  # (m,) distance of the centres at touch
+    pair_touching: float
+
+
+class SpacecraftPlanner:
+    """Plans (x_d, u_d) of least effort for all agents together.
+
+    Args:
+        settings: The problem and how hard to look.
+    """
+
+    def __init__(self, settings: SpacecraftPlannerSettings | None = None) -> None:
+        """Remember the settings."""
+        self.settings = settings or SpacecraftPlannerSettings()
+
+    def plan(
+        self,
+        starts: FloatArray,
+        goals: FloatArray,
+        obstacles: FloatArray,
+        obstacle_radius: FloatArray | float,
+        agent_radius: float,
+        duration: float | None = None,
+    ) -> JointPlan:
+        """Plan from the given states to rest at the goals.
+
+        Args:
+            starts: Positions (n, 2), or positions and velocities (n, 4) [m, m/s].
+            goals: Positions, shape (n, 2) [m].
+            obstacles: Centres, shape (m, 2) [m]; m may be 0.
+            obstacle_radius: One radius, or one per obstacle (m,) [m].
+            agent_radius: Radius of every agent [m].
+            duration: Time to the goals [s]; the horizon if left out. It is rounded down to whole
+                node steps, of which two must remain.
+
+        Returns:
+            The plan. Where no guess led to a solved plan, the one that violates least, with
+            `solved` False.
+
+        Raises:
+            ValueError: An array is misshapen or not finite, or no time remains.
+        """
+        begun = time.perf_counter()
+        settings = self.settings
+        scene = _scene(starts, goals, obstacles, obstacle_radius, agent_radius)
+        nodes = settings.nodes
+        if duration is not None:
+            nodes = math.floor(duration / settings.node_period + 1e-9)
+            if nodes < 2:
+                raise ValueError(
+                    f"duration={duration!r} s leaves fewer than two node steps of "
+                    f"{settings.node_period} s"
+                )
+        problem = self._problem(scene, nodes, _SPARE)
+        solved: list[JointPlan] = []
+        closest: tuple[float, JointPlan] | None = None
+        iterations = attempts = 0
+        for name, guess in self._guesses(scene, problem):
+            solution = solve_joint(problem, guess, settings.scp)
+            iterations += solution.iterations
+            attempts += 1
+            plan = self._checked(scene, solution, name, nodes)
+            if plan.solved:
+                solved.append(plan)
+                if len(solved) >= settings.candidates:
+                    break
+            elif closest is None or solution.violation < closest[0]:
+                closest = solution.violation, plan
+        if solved:
+            chosen = min(solved, key=lambda plan: float(np.sum(plan.effort)))
+        else:
+            assert closest is not None  # the first guess always exists
+            chosen = closest[1]
+        seconds = time.perf_counter() - begun
+        return replace(chosen, iterations=iterations, attempts=attempts, seconds=seconds)
+
+    def _problem(self, scene: _Scene, nodes: int, spare: float) -> JointProblem:
+        settings = self.settings
+        substeps = divisor("control_period", settings.control_period, settings.node_period)
+        times = settings.control_period * np.arange(nodes * substeps + 1)
+        obstacle_required, pair_required = self._required(scene, times, spare)
+        moving = np.abs(scene.starts[:, 2:])
+        return JointProblem(
+            scene.starts,
+            scene.goals,
+            scene.obstacles,
+            obstacle_required,
+            pair_required,
+            settings.node_period,
+            substeps,
+            settings.mass,
+            np.maximum(settings.speed_limit, moving),
+        )
+
+    def _required(
+        self, scene: _Scene, times: FloatArray, spare: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the distances to keep, (t, n, m) and (t, P): less near ends that lack room."""
+        first, second = np.triu_indices(len(scene.starts), 1)
+        gaps, apart = [], []
+        for ends in (scene.starts, scene.goals):
+            place = ends[:, :2]
+            gaps.append(np.linalg.norm(place[:, None] - scene.obstacles, axis=-1))
+            apart.append(np.linalg.norm(place[first] - place[second], axis=-1))
+        settings = self.settings
+        gone = settings.margin_growth * times
+        left = settings.margin_growth * (times[-1] - times)
+        full = scene.touching + settings.obstacle_margin + spare
+        obstacle_required = np.minimum(gaps[0] + gone[:, None, None], gaps[1] + left[:, None, None])
+        full_pair = scene.pair_touching + settings.pair_margin + spare
+        pair_required = np.minimum(apart[0] + gone[:, None], apart[1] + left[:, None])
+        return np.minimum(obstacle_required, full), np.minimum(pair_required, full_pair)
+
+    def _guesses(self, scene: _Scene, problem: JointProblem) -> Iterator[tuple[str, FloatArray]]:
+        """Yield guesses of the positions (n, K + 1, 2) on the control grid, best first."""
+        settings, grid = self.settings, self.settings.grid
+        begin, end = scene.starts[:, :2], scene.goals[:, :2]
+        distance = scene.touching + settings.obstacle_margin
+        instants = problem.nodes * problem.substeps + 1
+        times = settings.control_period * np.arange(instants)
+        duration = float(times[-1])
+        paths = shortest_paths(begin, end, scene.obstacles, distance, grid)
+        sidestep = grid.sidestep if len(begin) > 1 else 0.0
+        for restart in range(settings.restarts + 1):
+            depart, arrive = np.zeros(len(paths)), np.full(len(paths), duration)
+            if restart > 0:
+                rng = np.random.default_rng([_RESTART_SEED, restart])
+                depart = rng.uniform(0.0, 0.4 * duration, len(paths))
+                arrive = rng.uniform(0.6 * duration, duration, len(paths))
+            name = "shortest paths" if restart == 0 else f"shortest paths, time shift {restart}"
+            yield (
+                name,
+                np.stack(
+                    [
+                        walk(path, smooth_progress(times, early, late), sidestep)
+                        for path, early, late in zip(paths, depart, arrive, strict=True)
+                    ]
+                ),
+            )
+        way = np.array([np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1)) for path in paths])
+        pair_distance = scene.pair_touching + settings.pair_margin
+        for search in range(settings.searches):
+            # The longest way first, then orders drawn at random.
+            order = np.argsort(-way, kind="stable")
+            if search > 0:
+                order = np.random.default_rng([_RESTART_SEED, 1000 + search]).permutation(len(way))
+            guess = search_in_turn(
+                begin, end, scene.obstacles, distance, pair_distance, times, order, grid
+            )
+            yield f"search in turn {search}", guess
+
+    def _checked(
+        self, scene: _Scene, solution: JointSolution, name: str, nodes: int
+    ) -> JointPlan:
+        """Turn a solution into a plan, after an independent check on a finer grid."""
+        settings = self.settings
+        count = divisor("check_period", settings.check_period, settings.node_period)
+        places, _ = positions_between(
+            solution.states, solution.forces, settings.mass, settings.node_period, count
+        )
+        gaps, apart = swept_distances(places, scene.obstacles)
+        times = settings.check_period * np.arange(nodes * count + 1)
+        obstacle_required, pair_required = self._required(scene, times, 0.0)
+        # A sweep between two instants must keep the lesser of their distances.
+        obstacle_least = np.minimum(obstacle_required[:-1], obstacle_required[1:])
+        pair_least = np.minimum(pair_required[:-1], pair_required[1:])
+        kept = bool(np.all(gaps >= obstacle_least - 1e-6) and np.all(apart >= pair_least - 1e-6))
+        clearance = min(
+            float(np.min(gaps - scene.touching, initial=np.inf)),
+            float(np.min(apart - scene.pair_touching, initial=np.inf)),
+        )
+        status = f"{name}: {solution.status}"
+        if solution.solved and not kept:
+            status += "; a margin is broken between instants"
+        if clearance < 0.0:
+            status += f"; bodies overlap by {-clearance:.3f} m"
+        return JointPlan(
+            solution.states,
+            solution.forces,
+            settings.node_period,
+            settings.mass,
+            solution.solved and kept and clearance >= 0.0,
+            status,
+            clearance,
+            solution.iterations,
+            1,
+            0.0,
+        )
+
+
+def swept_distances(
+    places: FloatArray, obstacles: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the least distances of centres while each agent moves straight between instants.
+
+    Args:
+        places: Positions, shape (n, K + 1, 2) [m].
+        obstacles: Centres, shape (m, 2) [m].
+
+    Returns:
+        To obstacles, shape (K, n, m), and between agents, shape (K, P), pairs in the order of
+        `numpy.triu_indices` [m].
+    """
+    gaps = segment_distance(places[:, :-1], places[:, 1:], obstacles).transpose(1, 0, 2)
+    first, second = np.triu_indices(len(places), 1)
+    between = places[first] - places[second]
+    apart = segment_distance(between[:, :-1], between[:, 1:], np.zeros((1, 2)))[..., 0]
+    return gaps, apart.T
+
+
+def divisor(name: str, period: float, whole: float) -> int:
+    """Return how many periods make the whole.
+
+    Raises:
+        ValueError: It is not a whole number.
+    """
+    count = round(whole / period) if period > 0.0 else 0
+    if count < 1 or abs(count * period - whole) > 1e-9 * whole:
+        raise ValueError(f"{name}={period!r} s does not divide the node step of {whole} s")
+    return count
+
+
+def _scene(
+    starts: FloatArray,
+    goals: FloatArray,
+    obstacles: FloatArray,
+    obstacle_radius: FloatArray | float,
+    agent_radius: float,
+) -> _Scene:
+    begin = np.asarray(starts, dtype=np.float64)
+    end = np.asarray(goals, dtype=np.float64)
+    centres = np.asarray(obstacles, dtype=np.float64).reshape(-1, 2)
+    if begin.ndim != 2 or begin.shape[1] not in (2, 4) or len(begin) == 0:
+        raise ValueError(f"starts of shape {begin.shape} must be (n, 2) or (n, 4) with n >= 1")
+    if end.shape != (len(begin), 2):
+        raise ValueError(f"goals of shape {end.shape} must be ({len(begin)}, 2)")
+    radius = np.broadcast_to(np.asarray(obstacle_radius, dtype=np.float64), (len(centres),))
+    for name, array in (("starts", begin), ("goals", end), ("obstacles", centres)):
+        if not np.all(np.isfinite(array)):
+            raise ValueError(f"{name} must be finite")
+    if not (agent_radius > 0.0 and np.all(radius > 0.0)):
+        raise ValueError("agent_radius and every obstacle_radius must be > 0")
+    if begin.shape[1] == 2:
+        begin = np.hstack([begin, np.zeros_like(begin)])
+    return _Scene(
+        begin,
+        np.hstack([end, np.zeros_like(end)]),
+        centres,
+        radius + agent_radius,
+        2.0 * agent_radius,
+    )
