@@ -162,6 +162,7 @@ def test_two_processes_give_what_one_gives(metric, data, folder, tmp_path):
 
 
 INTERRUPTED = """
+import os
 import sys
 from pathlib import Path
 from lagros_policies.contraction import load_metric
@@ -172,6 +173,15 @@ def report(done):
     if done == 3:
         sys.stdin.readline()  # go no further: the shards that are missing stay missing
 
+def stuck(descriptor, counted=[]):
+    counted.append(descriptor)
+    if len(counted) == 3:  # the manifest, the first shard, and now the second
+        print("writing", flush=True)
+        sys.stdin.readline()
+
+if sys.argv[3] == "write":
+    os.fsync = stuck
+
 if __name__ == "__main__":
     settings = ExpertDataSettings(
         plans=8, samples=160, shards=4, disturbance_bound=0.8, seed=5
@@ -181,30 +191,32 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("pause", [0.0, 0.02])
+@pytest.mark.parametrize("where", ["work", "write"])
 def test_kill_loses_no_finished_shard_and_the_rest_is_made_again(
-    metric, data, folder, tmp_path, pause
+    metric, data, folder, tmp_path, where
 ):
     save_metric(metric, tmp_path / "metric.json")
     target = tmp_path / "data"
     process = subprocess.Popen(
-        [sys.executable, "-c", INTERRUPTED, str(target), str(tmp_path / "metric.json")],
+        [sys.executable, "-c", INTERRUPTED, str(target), str(tmp_path / "metric.json"), where],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
     )
+    awaited = "1" if where == "work" else "writing"
     with process:
         for line in process.stdout:
-            if line.strip() == "1":
+            if line.strip() in (awaited, "3"):
                 break
-        time.sleep(pause)  # in the middle of the second shard
+        if where == "work":
+            time.sleep(0.02)  # into the second shard
         process.kill()
         process.wait()
-        process.stdout.close()
+    assert line.strip() == awaited
     finished = {path.name: path.stat().st_mtime_ns for path in shards(target)}
-    assert 1 <= len(finished) <= 3
+    assert len(finished) == 1 if where == "write" else 1 <= len(finished) <= 3
     for name in finished:
         assert (target / name).read_bytes() == (folder / name).read_bytes()
     done = []

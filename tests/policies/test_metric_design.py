@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.dynamics import state_dependent_coefficient
 from lagros_policies.contraction import (
     CvStemSettings,
@@ -17,6 +18,11 @@ from lagros_policies.contraction import (
     design_on_pool,
     search_rate,
     verify_metric,
+)
+from lagros_policies.metric_design import (
+    MetricDesignSettings,
+    design_cartpole_metric,
+    tube_samples,
 )
 
 
@@ -241,3 +247,40 @@ def test_region_bounds_each_quantity_and_neither_position_nor_speed():
     for name, triple in outside.items():
         state, nominal, control = (np.array(part, float) for part in triple)
         assert not region.contains(state, nominal, control), name
+
+
+SMALL = MetricDesignSettings(plans=10, pool=300, checks=250, seed=3)
+
+
+def test_design_from_nothing_is_verified_and_repeatable(system):
+    metric = design_cartpole_metric(SMALL)
+    again = design_cartpole_metric(SMALL)
+    assert np.array_equal(metric.coefficients, again.coefficients)
+    assert metric.verification == again.verification
+    assert metric.region == SMALL.region
+    assert metric.contraction_rate == SMALL.cvstem.contraction_rate
+    assert (metric.verification.samples, metric.verification.seed) == (250, 3)
+    other = design_cartpole_metric(replace(SMALL, seed=4))
+    assert not np.array_equal(metric.coefficients, other.coefficients)
+
+
+def test_design_and_check_share_no_episode_and_keep_to_the_region():
+    task_settings = CartPoleSettings()
+    goals = []
+    for namespace in (1, 2):
+        triples = tube_samples(SMALL, task_settings, namespace, 400)
+        assert triples.state.shape == (400, 4)
+        inside = SMALL.region.contains(triples.state, triples.nominal, triples.nominal_control)
+        assert np.all(inside)
+        error = np.abs(triples.state - triples.nominal)
+        # The box of errors is filled to its edges.
+        assert error[:, 1].max() > 0.9 * SMALL.region.angle_error
+        assert error[:, 3].max() > 0.9 * SMALL.region.angular_rate_error
+        goals.append(triples.nominal)
+    assert not np.any(np.isin(goals[0][:, 1], goals[1][:, 1]))
+
+
+@pytest.mark.parametrize("bad", [{"plans": 0}, {"pool": 0}, {"checks": 0}])
+def test_design_settings_out_of_range_are_refused(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        MetricDesignSettings(**bad)
