@@ -5,7 +5,7 @@ import stat
 
 import pytest
 
-from lagros_policies.files import write_atomic
+from lagros_envs.files import write_atomic
 
 
 def test_text_and_bytes_are_written_into_a_new_folder(tmp_path):

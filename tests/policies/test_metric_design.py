@@ -9,6 +9,7 @@ import scipy.linalg
 
 from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.dynamics import state_dependent_coefficient
+from lagros_policies import metric_design
 from lagros_policies.contraction import (
     CvStemSettings,
     InfeasibleError,
@@ -264,20 +265,33 @@ def test_design_from_nothing_is_verified_and_repeatable(system):
     assert not np.array_equal(metric.coefficients, other.coefficients)
 
 
-def test_design_and_check_share_no_episode_and_keep_to_the_region():
-    task_settings = CartPoleSettings()
-    goals = []
-    for namespace in (1, 2):
-        triples = tube_samples(SMALL, task_settings, namespace, 400)
-        assert triples.state.shape == (400, 4)
-        inside = SMALL.region.contains(triples.state, triples.nominal, triples.nominal_control)
-        assert np.all(inside)
-        error = np.abs(triples.state - triples.nominal)
-        # The box of errors is filled to its edges.
-        assert error[:, 1].max() > 0.9 * SMALL.region.angle_error
-        assert error[:, 3].max() > 0.9 * SMALL.region.angular_rate_error
-        goals.append(triples.nominal)
-    assert not np.any(np.isin(goals[0][:, 1], goals[1][:, 1]))
+def test_design_and_check_share_no_episode(monkeypatch):
+    seen = []
+
+    def spy(function, place):
+        def call(*arguments):
+            seen.append(arguments[place].nominal[:, 1])
+            return function(*arguments)
+
+        return call
+
+    monkeypatch.setattr(metric_design, "design_on_pool", spy(design_on_pool, 1))
+    monkeypatch.setattr(metric_design, "verify_metric", spy(verify_metric, 2))
+    metric_design.design_cartpole_metric(SMALL)
+    pool, checks = seen
+    assert (len(pool), len(checks)) == (300, 250)
+    assert not np.any(np.isin(pool, checks))
+
+
+def test_samples_of_the_tubes_fill_the_region_and_keep_to_it():
+    triples = tube_samples(SMALL, CartPoleSettings(), 1, 400)
+    assert triples.state.shape == (400, 4)
+    inside = SMALL.region.contains(triples.state, triples.nominal, triples.nominal_control)
+    assert np.all(inside)
+    error = np.abs(triples.state - triples.nominal)
+    # The box of errors is filled to its edges.
+    assert error[:, 1].max() > 0.9 * SMALL.region.angle_error
+    assert error[:, 3].max() > 0.9 * SMALL.region.angular_rate_error
 
 
 @pytest.mark.parametrize("bad", [{"plans": 0}, {"pool": 0}, {"checks": 0}])
