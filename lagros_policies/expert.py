@@ -57,7 +57,7 @@ class CartPoleExpert:
         """Build planner and law."""
         self.task = task or CartPoleSettings()
         self.metric = metric or load_metric()
-        self.feedback = feedback or FeedbackSettings()
+        self.feedback = feedback or FeedbackSettings(tube=self.task.tube)
         self.planner = CartPolePlanner(self.task)
         self.law = HeldControl(
             self.task.system,

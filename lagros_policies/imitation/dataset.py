@@ -171,6 +171,8 @@ def make_shard(
         # A plan that does not hold is no target; the share is reported with the data.
         if plan.solved:
             plans.append(plan)
+    if not plans:
+        raise ValueError(f"none of the {count} episodes of shard {index} has a plan")
     states = np.stack([plan.states for plan in plans])
     controls = np.stack([plan.controls for plan in plans])
     tracked = expert.track(states, controls)
@@ -302,6 +304,7 @@ def _claim(
         "coefficients": hashlib.sha256(metric.coefficients.tobytes()).hexdigest(),
         "alpha": metric.contraction_rate,
         "region": asdict(metric.region),
+        "feedback": asdict(CartPoleExpert(metric, task_settings).feedback),
     }
     record = json.loads(
         json.dumps({"data": asdict(settings), "task": asdict(task_settings), "metric": law})

@@ -49,12 +49,12 @@ class JointScpSettings:
 
     max_iterations: int = 25
     effort_tolerance: float = 1e-2
-    distance_tolerance: float = 1e-3
+    distance_tolerance: float = 4e-3
     reach: float = 1.0
     near: float = 0.1
     penalty: float = 1.0
     qp_tolerance: float = 1e-6
-    patience: int = 8
+    patience: int = 6
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -51,13 +51,14 @@ class SpacecraftPlannerSettings:
         mass: m of one spacecraft [kg].
         obstacle_margin: Room beyond touching between an agent and an obstacle [m].
         pair_margin: Room beyond touching between two agents [m].
-        margin_growth: Where a start or goal lies inside a margin, how fast the margin grows from
-            what there is, and shrinks towards the goal [m/s].
+        margin_growth: Where a start or goal lies inside a margin, the acceleration at which the
+            margin grows from what there is, and shrinks towards the goal [m/s^2].
         speed_limit: Largest speed per axis; a node step at this speed must not cross an agent and
             its margins [m/s].
         candidates: Solved plans among which the one of least effort is taken.
-        restarts: Guesses from time-shifted shortest paths after the first.
-        searches: Guesses by search in space and time, in priority order, after those.
+        restarts: Guesses from time-shifted shortest paths after the first guess.
+        searches: Guesses by search in space and time, one agent after the other by priority; the
+            two kinds take turns.
         check_period: Period of the final check, swept between its instants [s].
         scp: How to iterate.
         grid: How to guess.
@@ -72,7 +73,7 @@ class SpacecraftPlannerSettings:
     mass: float = 1.0
     obstacle_margin: float = 0.3
     pair_margin: float = 0.3
-    margin_growth: float = 0.05
+    margin_growth: float = 0.02
     speed_limit: float = 0.7
     candidates: int = 1
     restarts: int = 3
@@ -265,11 +266,12 @@ class SpacecraftPlanner:
         gaps, apart = [], []
         for ends in (scene.starts, scene.goals):
             place = ends[:, :2]
-            gaps.append(np.linalg.norm(place[:, None] - scene.obstacles, axis=-1))
-            apart.append(np.linalg.norm(place[first] - place[second], axis=-1))
+            gap = np.linalg.norm(place[:, None] - scene.obstacles, axis=-1)
+            gaps.append(gap + spare - _SPARE)
+            apart.append(np.linalg.norm(place[first] - place[second], axis=-1) + spare - _SPARE)
         settings = self.settings
-        gone = settings.margin_growth * times
-        left = settings.margin_growth * (times[-1] - times)
+        gone = 0.5 * settings.margin_growth * times**2
+        left = 0.5 * settings.margin_growth * (times[-1] - times) ** 2
         full = scene.touching + settings.obstacle_margin + spare
         obstacle_required = np.minimum(gaps[0] + gone[:, None, None], gaps[1] + left[:, None, None])
         full_pair = scene.pair_touching + settings.pair_margin + spare
@@ -286,33 +288,31 @@ class SpacecraftPlanner:
         duration = float(times[-1])
         paths = shortest_paths(begin, end, scene.obstacles, distance, grid)
         sidestep = grid.sidestep if len(begin) > 1 else 0.0
-        for restart in range(settings.restarts + 1):
-            depart, arrive = np.zeros(len(paths)), np.full(len(paths), duration)
-            if restart > 0:
-                rng = np.random.default_rng([_RESTART_SEED, restart])
-                depart = rng.uniform(0.0, 0.4 * duration, len(paths))
-                arrive = rng.uniform(0.6 * duration, duration, len(paths))
-            name = "shortest paths" if restart == 0 else f"shortest paths, time shift {restart}"
-            yield (
-                name,
-                np.stack(
-                    [
-                        walk(path, smooth_progress(times, early, late), sidestep)
-                        for path, early, late in zip(paths, depart, arrive, strict=True)
-                    ]
-                ),
-            )
         way = np.array([np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1)) for path in paths])
         pair_distance = scene.pair_touching + settings.pair_margin
-        for search in range(settings.searches):
-            # The longest way first, then orders drawn at random.
-            order = np.argsort(-way, kind="stable")
-            if search > 0:
-                order = np.random.default_rng([_RESTART_SEED, 1000 + search]).permutation(len(way))
-            guess = search_in_turn(
-                begin, end, scene.obstacles, distance, pair_distance, times, order, grid
-            )
-            yield f"search in turn {search}", guess
+        for turn in range(max(settings.restarts + 1, settings.searches)):
+            if turn <= settings.restarts:
+                depart, arrive = np.zeros(len(paths)), np.full(len(paths), duration)
+                if turn > 0:
+                    rng = np.random.default_rng([_RESTART_SEED, 0, turn])
+                    depart = rng.uniform(0.0, 0.4 * duration, len(paths))
+                    arrive = rng.uniform(0.6 * duration, duration, len(paths))
+                name = "shortest paths" + (f", time shift {turn}" if turn > 0 else "")
+                walks = [
+                    walk(path, smooth_progress(times, early, late), sidestep)
+                    for path, early, late in zip(paths, depart, arrive, strict=True)
+                ]
+                yield name, np.stack(walks)
+            if turn < settings.searches:
+                # The longest way first, then orders drawn at random.
+                order = np.argsort(-way, kind="stable")
+                if turn > 0:
+                    rng = np.random.default_rng([_RESTART_SEED, 1, turn])
+                    order = rng.permutation(len(way))
+                guess = search_in_turn(
+                    begin, end, scene.obstacles, distance, pair_distance, times, order, grid
+                )
+                yield f"search in priority order {turn}", guess
 
     def _checked(
         self, scene: _Scene, solution: JointSolution, name: str, nodes: int

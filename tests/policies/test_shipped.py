@@ -87,6 +87,17 @@ def test_condition_of_the_metric_holds_at_10000_fresh_states(
 
 
 @needs(METRIC)
+def test_some_held_control_contracts_at_fresh_states(shipped, make_plans, make_samples):
+    """The condition over the hold, which u* imposes, is not implied by the continuous one."""
+    samples = make_samples(shipped.region, make_plans(40, seed=2026), 2000, seed=3)
+    a, b, c = CartPoleExpert(shipped).law.quadratic(
+        samples.state, samples.nominal, samples.nominal_control
+    )
+    assert np.all(a > 0.0)
+    assert np.all(b * b >= a * c)
+
+
+@needs(METRIC)
 def test_starts_of_the_task_lie_in_the_region_of_the_metric(shipped, plans):
     states, controls = plans
     assert shipped.region.angle > np.pi / 3

@@ -1,0 +1,98 @@
+"""Which thrusters fire: the u >= 0 of least norm for a wrench, in closed form.
+
+The eight thrusters are four opposing pairs, so that each pair is one signed thruster s and the
+least u >= 0 fires one of the two: u = (max(s, 0), max(-s, 0)) with ||u|| = ||s||. The four signed
+thrusters make the wrench w = G s with
+
+    G = [[1, 1, 0, 0], [0, 0, 1, 1], [l, -l, b, -b]],  G G' = diag(2, 2, 2 l^2 + 2 b^2),
+
+whose least s is G'(G G')^-1 w. Hence min ||u||^2 = (F_1^2 + F_2^2)/2 + tau^2 / (2 l^2 + 2 b^2):
+force and torque do not compete, the heading does not matter, and zero torque costs least.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.dynamics.spacecraft import HEADING, Spacecraft
+
+FloatArray = NDArray[np.float64]
+
+# The pairs, as (positive, negative) thrusters of the signed ones; see `Spacecraft.wrench`.
+_POSITIVE = (5, 4, 7, 6)
+_NEGATIVE = (0, 1, 2, 3)
+
+
+def allocate(body: Spacecraft, wrench: FloatArray) -> FloatArray:
+    """Return the u >= 0 of least norm that makes a wrench.
+
+    Args:
+        body: The spacecraft.
+        wrench: Forces along the body's two axes and torque, shape (..., 3) [N, N, N m].
+
+    Returns:
+        u, shape (..., 8) [N]; `body.wrench` of it is the wrench.
+    """
+    half = 0.5 * wrench[..., :2]
+    lever = wrench[..., 2] / (2.0 * (body.arm**2 + body.side_arm**2))
+    turn_first, turn_second = body.arm * lever, body.side_arm * lever
+    signed = np.stack(
+        [
+            half[..., 0] + turn_first,
+            half[..., 0] - turn_first,
+            half[..., 1] + turn_second,
+            half[..., 1] - turn_second,
+        ],
+        axis=-1,
+    )
+    thrust = np.empty((*signed.shape[:-1], 8))
+    thrust[..., _POSITIVE] = np.maximum(signed, 0.0)
+    thrust[..., _NEGATIVE] = np.maximum(-signed, 0.0)
+    return thrust
+
+
+def least_effort(body: Spacecraft, wrench: FloatArray) -> FloatArray:
+    """Return min ||u||^2 for wrenches (..., 3), shape (...) [N^2]."""
+    lever = 2.0 * (body.arm**2 + body.side_arm**2)
+    effort: FloatArray = 0.5 * np.sum(wrench[..., :2] ** 2, axis=-1) + wrench[..., 2] ** 2 / lever
+    return effort
+
+
+def to_body(force: FloatArray, heading: FloatArray) -> FloatArray:
+    """Turn forces (..., 2) from the world's axes into the body's at headings (...) [rad]."""
+    sine, cosine = np.sin(heading), np.cos(heading)
+    first = cosine * force[..., 0] - sine * force[..., 1]
+    second = sine * force[..., 0] + cosine * force[..., 1]
+    return np.stack([first, second], axis=-1)
+
+
+def wrench_of_acceleration(
+    body: Spacecraft, state: FloatArray, acceleration: FloatArray
+) -> FloatArray:
+    """Return the wrench that accelerates a body.
+
+    Args:
+        body: The spacecraft.
+        state: x, shape (..., 6).
+        acceleration: Of x, y and heading, shape (..., 3) [m/s^2, m/s^2, rad/s^2].
+
+    Returns:
+        The wrench in the body's axes, shape (..., 3) [N, N, N m].
+    """
+    force = to_body(body.mass * acceleration[..., :2], state[..., HEADING])
+    torque = 2.0 * body.inertia * acceleration[..., 2:]
+    return np.concatenate([force, torque], axis=-1)
+
+
+def thrust_for_acceleration(
+    body: Spacecraft, state: FloatArray, acceleration: FloatArray
+) -> FloatArray:
+    """Return the u >= 0 of least norm that gives an acceleration, shape (..., 8) [N].
+
+    Args:
+        body: The spacecraft.
+        state: x, shape (..., 6).
+        acceleration: Of x, y and heading, shape (..., 3) [m/s^2, m/s^2, rad/s^2].
+    """
+    return allocate(body, wrench_of_acceleration(body, state, acceleration))

@@ -1,0 +1,140 @@
+"""u* of the spacecraft: the least wrench that makes the error contract under a hold.
+
+With e = (position, velocity) per axis and a constant metric, the condition from one control instant
+to the next, V(F e + g v) <= exp(-2 alpha h) V(e) summed over x and y, is a ball of accelerations v
+(deviations from the nominal one). Its point nearest to the preferred deviation, zero unless said
+otherwise, is Theorem 2's least-norm control for a held control, in closed form. The heading is an
+axis of its own, with its own rate: the plan never turns the body, and nothing in the position's
+certificate asks for a heading.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.dynamics.spacecraft import HEADING, SPIN, Spacecraft
+from lagros_policies.contraction.double_integrator import AxisMetric, flow
+from lagros_policies.contraction.thrusters import thrust_for_acceleration
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HeldBall:
+    """The accelerations under which a few axes with one metric contract together.
+
+    Attributes:
+        metric: The metric of each axis, with the hold's period.
+
+    Raises:
+        ValueError: The metric has no period.
+    """
+
+    metric: AxisMetric
+
+    def __post_init__(self) -> None:
+        """Check the period."""
+        if self.metric.period == 0.0:
+            raise ValueError("a held control needs a metric with a period")
+
+    def ball(self, error: FloatArray, speed_error: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return centre (..., a) and radius (...) of the ball of contracting deviations.
+
+        Args:
+            error: Position errors, shape (..., a).
+            speed_error: Velocity errors, shape (..., a).
+        """
+        metric = self.metric
+        h = metric.period
+        matrix = metric.matrix
+        push = np.array([0.5 * h * h, h])
+        pull = push @ matrix
+        a = float(pull @ push)
+        step = flow(h)
+        b = (pull @ step)[0] * error + (pull @ step)[1] * speed_error
+        excess = step.T @ matrix @ step - np.exp(-2.0 * metric.rate * h) * matrix
+        c = np.sum(
+            excess[0, 0] * error**2
+            + 2.0 * excess[0, 1] * error * speed_error
+            + excess[1, 1] * speed_error**2,
+            axis=-1,
+        )
+        # b b' - a c >= 0 by the metric's own condition; below zero it is rounding.
+        squared = np.maximum(np.sum(b * b, axis=-1) - a * c, 0.0)
+        return -b / a, np.sqrt(squared) / a
+
+    def __call__(
+        self, error: FloatArray, speed_error: FloatArray, preferred: FloatArray | float = 0.0
+    ) -> FloatArray:
+        """Return the contracting deviation (..., a) nearest to the preferred one.
+
+        Args:
+            error: Position errors, shape (..., a) [m] or [rad].
+            speed_error: Velocity errors, shape (..., a), per second.
+            preferred: Deviation taken where it contracts, shape (..., a), per second squared.
+        """
+        centre, radius = self.ball(error, speed_error)
+        away = preferred - centre
+        distance = np.linalg.norm(away, axis=-1)
+        share = np.minimum(1.0, radius / np.where(distance > 0.0, distance, 1.0))
+        deviation: FloatArray = centre + share[..., None] * away
+        return deviation
+
+
+@dataclass(frozen=True)
+class WrenchTracking:
+    """u* and its thrusters, for any number of agents at once.
+
+    Attributes:
+        body: The spacecraft.
+        plane: Metric of x and y.
+        turning: Metric of the heading, of the same period.
+
+    Raises:
+        ValueError: The periods differ, or are zero.
+    """
+
+    body: Spacecraft
+    plane: AxisMetric
+    turning: AxisMetric
+
+    def __post_init__(self) -> None:
+        """Check the periods."""
+        if self.plane.period != self.turning.period or self.plane.period == 0.0:
+            raise ValueError(
+                f"plane and turning need one period > 0, not {self.plane.period!r} and "
+                f"{self.turning.period!r}"
+            )
+
+    def acceleration(
+        self, state: FloatArray, nominal: FloatArray, nominal_acceleration: FloatArray
+    ) -> FloatArray:
+        """Return the acceleration of u*, shape (..., 3) [m/s^2, m/s^2, rad/s^2].
+
+        Args:
+            state: x, shape (..., 6).
+            nominal: x_d, shape (..., 6).
+            nominal_acceleration: Of x, y and heading under u_d, shape (..., 3).
+        """
+        error = state - nominal
+        plane = HeldBall(self.plane)(error[..., :2], error[..., 3:5])
+        turn = HeldBall(self.turning)(error[..., 2:3], error[..., 5:])
+        value: FloatArray = nominal_acceleration + np.concatenate([plane, turn], axis=-1)
+        return value
+
+    def control(
+        self, state: FloatArray, nominal: FloatArray, nominal_acceleration: FloatArray
+    ) -> FloatArray:
+        """Return u*, shape (..., 8), all >= 0 [N]; arguments as of `acceleration`.
+
+        The wrench is held in the body's axes, which turn: it is made for the heading in the middle
+        of the hold.
+        """
+        wanted = self.acceleration(state, nominal, nominal_acceleration)
+        h = self.plane.period
+        middle = np.array(np.broadcast_to(state, (*wanted.shape[:-1], 6)))
+        middle[..., HEADING] += 0.5 * h * middle[..., SPIN] + 0.125 * h * h * wanted[..., 2]
+        return thrust_for_acceleration(self.body, middle, wanted)
