@@ -27,10 +27,10 @@ LEGEND = (
 
 
 def policy_label(policy: str, longest: int = _LONGEST_LABEL) -> str:
-    """Return the name of a policy in tables and figures: letter and name, or the file's stem."""
+    """Return the name of a policy in tables and figures: letter and name, or the file's name."""
     if policy in _LETTERS:
         return f"{_LETTERS[policy]} {policy}"
-    name = Path(policy).stem if policy.endswith(".zip") else policy
+    name = Path(policy).name if policy.endswith(".zip") else policy
     return name if len(name) <= longest else name[: longest - 1] + "…"
 
 

@@ -137,7 +137,7 @@ def test_percent_rounds_to_certainty_only_if_it_is(rate, text):
 
 def test_the_paper_letters_its_methods():
     assert tables.policy_label("tube-mpc") == "(b) tube-mpc"
-    assert tables.policy_label("runs/ppo.zip") == "ppo"
+    assert tables.policy_label("runs/ppo.zip") == "ppo.zip"
 
 
 def test_csv_has_a_line_per_row_and_no_curves(rows):
