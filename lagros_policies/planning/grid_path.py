@@ -41,7 +41,7 @@ class GridSettings:
     border: float = 1.5
     preference: float = 0.03
     crossing_cost: float = 30.0
-    sidestep: float = 0.05
+    sidestep: float = 0.4
     search_cell: float = 0.25
     search_period: float = 1.0
 
@@ -202,7 +202,7 @@ def search_in_turn(
     cell, duration = settings.search_cell, float(times[-1])
     origin, shape = _frame(starts, goals, obstacles, cell, settings.border)
     layers = max(2, round(duration / settings.search_period))
-    centres = origin + cell * np.stack(np.indices(shape), axis=-1)
+    centres = _centres(origin, shape, cell)
     gaps = np.linalg.norm(centres[:, :, None] - obstacles, axis=-1) - distance
     # Half a cell of leave: the programs that follow polish the guess.
     static = _price(np.min(gaps, axis=-1, initial=np.inf) + 0.5 * cell)
@@ -272,6 +272,12 @@ def _frame(
     return low, (int(count[0]), int(count[1]))
 
 
+def _centres(origin: FloatArray, shape: tuple[int, int], cell: float) -> FloatArray:
+    """Return the points of the grid, shape (rows, columns, 2)."""
+    first, second = (origin[axis] + cell * np.arange(shape[axis]) for axis in range(2))
+    return np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1)
+
+
 def _nearest_cell(
     points: FloatArray, origin: FloatArray, shape: tuple[int, int], cell: float
 ) -> IntArray:
@@ -290,7 +296,7 @@ def _graph(
     """Return the directed lengths between each cell and its sixteen nearest in sight."""
     count = shape[0] * shape[1]
     number = np.arange(count).reshape(shape)
-    centres = origin + settings.cell * np.stack(np.indices(shape), axis=-1)
+    centres = _centres(origin, shape, settings.cell)
     rows, columns, lengths = [], [], []
     for i, j in (s for s in _STEPS if math.gcd(*s) == 1):
         here = (_overlap(i, shape[0]), _overlap(j, shape[1]))

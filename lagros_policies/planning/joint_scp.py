@@ -357,7 +357,9 @@ def _half_planes(
         np.concatenate(
             [np.stack([agent, agent], axis=1), np.stack([first[pair], second[pair]], axis=1)]
         ),
-        np.concatenate([np.tile([1.0, 0.0], (len(agent), 1)), np.tile([1.0, -1.0], (len(pair), 1))]),
+        np.concatenate(
+            [np.tile([1.0, 0.0], (len(agent), 1)), np.tile([1.0, -1.0], (len(pair), 1))]
+        ),
         np.concatenate([normal, side]),
         np.concatenate([offset, needed[pair, when]]),
     )

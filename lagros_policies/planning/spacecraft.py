@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from lagros_policies.planning.grid_path import (
     GridSettings,
     search_in_turn,
-    segment_distance,
     shortest_paths,
     smooth_progress,
     walk,
 )
+from lagros_policies.planning.joint_plan import JointPlan, divisor, instants, swept_distances
 from lagros_policies.planning.joint_scp import (
     JointProblem,
     JointScpSettings,
@@ -49,8 +49,9 @@ class SpacecraftPlannerSettings:
         nodes: N, node steps in T.
         control_period: Period of the control grid; divides the node step [s].
         mass: m of one spacecraft [kg].
-        obstacle_margin: Room beyond touching between an agent and an obstacle [m].
-        pair_margin: Room beyond touching between two agents [m].
+        margins: Room beyond touching between an agent and an obstacle [m]; each is tried in turn
+            until a plan is found, so they fall.
+        pair_share: Room beyond touching between two agents, in margins.
         margin_growth: Where a start or goal lies inside a margin, the acceleration at which the
             margin grows from what there is, and shrinks towards the goal [m/s^2].
         speed_limit: Largest speed per axis; a node step at this speed must not cross an agent and
@@ -71,13 +72,13 @@ class SpacecraftPlannerSettings:
     nodes: int = 60
     control_period: float = 0.1
     mass: float = 1.0
-    obstacle_margin: float = 0.3
-    pair_margin: float = 0.3
+    margins: tuple[float, ...] = (0.3, 0.15)
+    pair_share: float = 1.0
     margin_growth: float = 0.02
     speed_limit: float = 0.7
     candidates: int = 1
-    restarts: int = 3
-    searches: int = 4
+    restarts: int = 2
+    searches: int = 2
     check_period: float = 0.05
     scp: JointScpSettings = field(default_factory=JointScpSettings)
     grid: GridSettings = field(default_factory=GridSettings)
@@ -88,10 +89,13 @@ class SpacecraftPlannerSettings:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name}={value!r} must be positive and finite")
-        for name in ("obstacle_margin", "pair_margin", "margin_growth"):
+        for name in ("pair_share", "margin_growth"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name}={value!r} must be finite and >= 0")
+        falling = sorted(self.margins, reverse=True)
+        if not self.margins or list(self.margins) != falling or not 0.0 <= falling[-1] < math.inf:
+            raise ValueError(f"margins={self.margins!r} must be falling numbers >= 0, at least one")
         if self.nodes < 2 or self.candidates < 1 or self.restarts < 0 or self.searches < 0:
             raise ValueError("nodes must be >= 2, candidates >= 1, restarts and searches >= 0")
         divisor("control_period", self.control_period, self.node_period)
@@ -101,60 +105,6 @@ class SpacecraftPlannerSettings:
     def node_period(self) -> float:
         """Time from node to node [s]."""
         return self.horizon / self.nodes
-
-
-@dataclass(frozen=True)
-class JointPlan:
-    """Target trajectories of all agents.
-
-    Attributes:
-        states: [p, v] at the nodes, shape (n, N + 1, 4) [m, m/s].
-        forces: F in the world's frame, held between nodes, shape (n, N, 2) [N].
-        node_period: Time from node to node [s].
-        mass: m [kg].
-        solved: Whether ends, margins and speeds are kept, between the nodes too.
-        status: How the plan was found, or why there is none, in words.
-        clearance: Least room beyond touching, swept between control instants [m]; inf for one
-            agent without obstacles.
-        iterations: Quadratic programs solved, over all guesses.
-        attempts: Guesses tried.
-        seconds: Wall time [s].
-    """
-
-    states: FloatArray
-    forces: FloatArray
-    node_period: float
-    mass: float
-    solved: bool
-    status: str
-    clearance: float
-    iterations: int
-    attempts: int
-    seconds: float
-
-    @property
-    def effort(self) -> FloatArray:
-        """The integral of ||u_d||^2 = ||F||^2 / 2 per agent, shape (n,) [N^2 s]."""
-        value: FloatArray = 0.5 * self.node_period * np.sum(self.forces**2, axis=(1, 2))
-        return value
-
-    def resample(self, period: float) -> tuple[FloatArray, FloatArray]:
-        """Return the same motion on a finer grid, exactly.
-
-        Args:
-            period: Divides the node step [s].
-
-        Returns:
-            [p, v], shape (n, K + 1, 4), and F held from instant to instant, shape (n, K, 2).
-
-        Raises:
-            ValueError: The period does not divide the node step.
-        """
-        count = divisor("period", period, self.node_period)
-        place, speed = positions_between(
-            self.states, self.forces, self.mass, self.node_period, count
-        )
-        return np.concatenate([place, speed], axis=-1), np.repeat(self.forces, count, axis=1)
 
 
 @dataclass(frozen=True)
@@ -186,6 +136,7 @@ class SpacecraftPlanner:
         obstacles: FloatArray,
         obstacle_radius: FloatArray | float,
         agent_radius: float,
+        core_radius: float | None = None,
         duration: float | None = None,
     ) -> JointPlan:
         """Plan from the given states to rest at the goals.
@@ -195,7 +146,8 @@ class SpacecraftPlanner:
             goals: Positions, shape (n, 2) [m].
             obstacles: Centres, shape (m, 2) [m]; m may be 0.
             obstacle_radius: One radius, or one per obstacle (m,) [m].
-            agent_radius: Radius of every agent [m].
+            agent_radius: Radius of every agent against the others [m].
+            core_radius: Their radius against obstacles [m], may be 0; the same if left out.
             duration: Time to the goals [s]; the horizon if left out. It is rounded down to whole
                 node steps, of which two must remain.
 
@@ -208,7 +160,7 @@ class SpacecraftPlanner:
         """
         begun = time.perf_counter()
         settings = self.settings
-        scene = _scene(starts, goals, obstacles, obstacle_radius, agent_radius)
+        scene = _scene(starts, goals, obstacles, obstacle_radius, agent_radius, core_radius)
         nodes = settings.nodes
         if duration is not None:
             nodes = math.floor(duration / settings.node_period + 1e-9)
@@ -217,21 +169,24 @@ class SpacecraftPlanner:
                     f"duration={duration!r} s leaves fewer than two node steps of "
                     f"{settings.node_period} s"
                 )
-        problem = self._problem(scene, nodes, _SPARE)
         solved: list[JointPlan] = []
         closest: tuple[float, JointPlan] | None = None
         iterations = attempts = 0
-        for name, guess in self._guesses(scene, problem):
-            solution = solve_joint(problem, guess, settings.scp)
-            iterations += solution.iterations
-            attempts += 1
-            plan = self._checked(scene, solution, name, nodes)
-            if plan.solved:
-                solved.append(plan)
-                if len(solved) >= settings.candidates:
-                    break
-            elif closest is None or solution.violation < closest[0]:
-                closest = solution.violation, plan
+        for margin in settings.margins:
+            problem = self._problem(scene, nodes, margin)
+            for name, guess in self._guesses(scene, problem, margin):
+                solution = solve_joint(problem, guess, settings.scp)
+                iterations += solution.iterations
+                attempts += 1
+                plan = self._checked(scene, solution, name, nodes, margin)
+                if plan.solved:
+                    solved.append(plan)
+                    if len(solved) >= settings.candidates:
+                        break
+                elif closest is None or solution.violation < closest[0]:
+                    closest = solution.violation, plan
+            if solved:
+                break
         if solved:
             chosen = min(solved, key=lambda plan: float(np.sum(plan.effort)))
         else:
@@ -240,11 +195,11 @@ class SpacecraftPlanner:
         seconds = time.perf_counter() - begun
         return replace(chosen, iterations=iterations, attempts=attempts, seconds=seconds)
 
-    def _problem(self, scene: _Scene, nodes: int, spare: float) -> JointProblem:
+    def _problem(self, scene: _Scene, nodes: int, margin: float) -> JointProblem:
         settings = self.settings
         substeps = divisor("control_period", settings.control_period, settings.node_period)
-        times = settings.control_period * np.arange(nodes * substeps + 1)
-        obstacle_required, pair_required = self._required(scene, times, spare)
+        times = instants(settings.control_period, nodes * substeps)
+        obstacle_required, pair_required = self._required(scene, times, margin, _SPARE)
         moving = np.abs(scene.starts[:, 2:])
         return JointProblem(
             scene.starts,
@@ -259,7 +214,7 @@ class SpacecraftPlanner:
         )
 
     def _required(
-        self, scene: _Scene, times: FloatArray, spare: float
+        self, scene: _Scene, times: FloatArray, margin: float, spare: float
     ) -> tuple[FloatArray, FloatArray]:
         """Return the distances to keep, (t, n, m) and (t, P): less near ends that lack room."""
         first, second = np.triu_indices(len(scene.starts), 1)
@@ -269,27 +224,27 @@ class SpacecraftPlanner:
             gap = np.linalg.norm(place[:, None] - scene.obstacles, axis=-1)
             gaps.append(gap + spare - _SPARE)
             apart.append(np.linalg.norm(place[first] - place[second], axis=-1) + spare - _SPARE)
-        settings = self.settings
-        gone = 0.5 * settings.margin_growth * times**2
-        left = 0.5 * settings.margin_growth * (times[-1] - times) ** 2
-        full = scene.touching + settings.obstacle_margin + spare
+        growth = 0.5 * self.settings.margin_growth
+        gone, left = growth * times**2, growth * (times[-1] - times) ** 2
+        full = scene.touching + margin + spare
         obstacle_required = np.minimum(gaps[0] + gone[:, None, None], gaps[1] + left[:, None, None])
-        full_pair = scene.pair_touching + settings.pair_margin + spare
+        full_pair = scene.pair_touching + self.settings.pair_share * margin + spare
         pair_required = np.minimum(apart[0] + gone[:, None], apart[1] + left[:, None])
         return np.minimum(obstacle_required, full), np.minimum(pair_required, full_pair)
 
-    def _guesses(self, scene: _Scene, problem: JointProblem) -> Iterator[tuple[str, FloatArray]]:
+    def _guesses(
+        self, scene: _Scene, problem: JointProblem, margin: float
+    ) -> Iterator[tuple[str, FloatArray]]:
         """Yield guesses of the positions (n, K + 1, 2) on the control grid, best first."""
         settings, grid = self.settings, self.settings.grid
         begin, end = scene.starts[:, :2], scene.goals[:, :2]
-        distance = scene.touching + settings.obstacle_margin
-        instants = problem.nodes * problem.substeps + 1
-        times = settings.control_period * np.arange(instants)
+        distance = scene.touching + margin
+        times = instants(settings.control_period, problem.nodes * problem.substeps)
         duration = float(times[-1])
         paths = shortest_paths(begin, end, scene.obstacles, distance, grid)
         sidestep = grid.sidestep if len(begin) > 1 else 0.0
         way = np.array([np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1)) for path in paths])
-        pair_distance = scene.pair_touching + settings.pair_margin
+        pair_distance = scene.pair_touching + settings.pair_share * margin
         for turn in range(max(settings.restarts + 1, settings.searches)):
             if turn <= settings.restarts:
                 depart, arrive = np.zeros(len(paths)), np.full(len(paths), duration)
@@ -315,7 +270,7 @@ class SpacecraftPlanner:
                 yield f"search in priority order {turn}", guess
 
     def _checked(
-        self, scene: _Scene, solution: JointSolution, name: str, nodes: int
+        self, scene: _Scene, solution: JointSolution, name: str, nodes: int, margin: float
     ) -> JointPlan:
         """Turn a solution into a plan, after an independent check on a finer grid."""
         settings = self.settings
@@ -324,8 +279,8 @@ class SpacecraftPlanner:
             solution.states, solution.forces, settings.mass, settings.node_period, count
         )
         gaps, apart = swept_distances(places, scene.obstacles)
-        times = settings.check_period * np.arange(nodes * count + 1)
-        obstacle_required, pair_required = self._required(scene, times, 0.0)
+        times = instants(settings.check_period, nodes * count)
+        obstacle_required, pair_required = self._required(scene, times, margin, 0.0)
         # A sweep between two instants must keep the lesser of their distances.
         obstacle_least = np.minimum(obstacle_required[:-1], obstacle_required[1:])
         pair_least = np.minimum(pair_required[:-1], pair_required[1:])
@@ -334,7 +289,7 @@ class SpacecraftPlanner:
             float(np.min(gaps - scene.touching, initial=np.inf)),
             float(np.min(apart - scene.pair_touching, initial=np.inf)),
         )
-        status = f"{name}: {solution.status}"
+        status = f"{name}, margin {margin:g} m: {solution.status}"
         if solution.solved and not kept:
             status += "; a margin is broken between instants"
         if clearance < 0.0:
@@ -347,42 +302,11 @@ class SpacecraftPlanner:
             solution.solved and kept and clearance >= 0.0,
             status,
             clearance,
+            margin,
             solution.iterations,
             1,
             0.0,
         )
-
-
-def swept_distances(
-    places: FloatArray, obstacles: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the least distances of centres while each agent moves straight between instants.
-
-    Args:
-        places: Positions, shape (n, K + 1, 2) [m].
-        obstacles: Centres, shape (m, 2) [m].
-
-    Returns:
-        To obstacles, shape (K, n, m), and between agents, shape (K, P), pairs in the order of
-        `numpy.triu_indices` [m].
-    """
-    gaps = segment_distance(places[:, :-1], places[:, 1:], obstacles).transpose(1, 0, 2)
-    first, second = np.triu_indices(len(places), 1)
-    between = places[first] - places[second]
-    apart = segment_distance(between[:, :-1], between[:, 1:], np.zeros((1, 2)))[..., 0]
-    return gaps, apart.T
-
-
-def divisor(name: str, period: float, whole: float) -> int:
-    """Return how many periods make the whole.
-
-    Raises:
-        ValueError: It is not a whole number.
-    """
-    count = round(whole / period) if period > 0.0 else 0
-    if count < 1 or abs(count * period - whole) > 1e-9 * whole:
-        raise ValueError(f"{name}={period!r} s does not divide the node step of {whole} s")
-    return count
 
 
 def _scene(
@@ -391,6 +315,7 @@ def _scene(
     obstacles: FloatArray,
     obstacle_radius: FloatArray | float,
     agent_radius: float,
+    core_radius: float | None,
 ) -> _Scene:
     begin = np.asarray(starts, dtype=np.float64)
     end = np.asarray(goals, dtype=np.float64)
@@ -403,14 +328,15 @@ def _scene(
     for name, array in (("starts", begin), ("goals", end), ("obstacles", centres)):
         if not np.all(np.isfinite(array)):
             raise ValueError(f"{name} must be finite")
-    if not (agent_radius > 0.0 and np.all(radius > 0.0)):
-        raise ValueError("agent_radius and every obstacle_radius must be > 0")
+    core = agent_radius if core_radius is None else core_radius
+    if not (0.0 < agent_radius < math.inf and 0.0 <= core < math.inf and np.all(radius > 0.0)):
+        raise ValueError("agent_radius and every obstacle_radius must be > 0, core_radius >= 0")
     if begin.shape[1] == 2:
         begin = np.hstack([begin, np.zeros_like(begin)])
     return _Scene(
         begin,
         np.hstack([end, np.zeros_like(end)]),
         centres,
-        radius + agent_radius,
+        radius + core,
         2.0 * agent_radius,
     )
