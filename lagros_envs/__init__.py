@@ -1,6 +1,7 @@
 """Environments with bounded disturbance; importing this package registers their ids.
 
-`gym.make("lagros/CartPole-v0")` and `gym.make_vec("lagros/CartPole-v0", num_envs=1024)`.
+`gym.make("lagros/CartPole-v0")` and `gym.make_vec("lagros/CartPole-v0", num_envs=1024)`; the same
+for "lagros/Spacecraft-v0", whose multi-agent form is `lagros_envs.spacecraft_v0.parallel_env()`.
 """
 
 from gymnasium.envs.registration import register
@@ -11,4 +12,10 @@ register(
     id="lagros/CartPole-v0",
     entry_point="lagros_envs.cartpole:CartPoleEnv",
     vector_entry_point="lagros_envs.cartpole_vector:CartPoleVectorEnv",
+)
+
+register(
+    id="lagros/Spacecraft-v0",
+    entry_point="lagros_envs.spacecraft_single:SpacecraftEnv",
+    vector_entry_point="lagros_envs.spacecraft_vector:SpacecraftVectorEnv",
 )

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
+from lagros_envs.autoreset import autoreset_mode_named
 from lagros_envs.disturbances import Disturbance, Situation, channel_mask
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_streams
@@ -75,7 +76,7 @@ class CartPoleVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.flo
         self.disturbance = Disturbance(
             disturbance, disturbance_bound, channel_mask(disturbance_channels, task.RATES), metric
         )
-        self.autoreset_mode = _autoreset_mode(autoreset_mode)
+        self.autoreset_mode = autoreset_mode_named(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = None
         self.named_space = task.named_space(self.settings)
@@ -228,8 +229,8 @@ class CartPoleVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.flo
         """Start the episodes of an autoreset, for which nobody has planned a nominal."""
         if self.disturbance.kind == "worst":
             raise ValueError(
-                'disturbance="worst" needs a nominal trajectory for every episode, and an autoreset '
-                'starts one without: use autoreset_mode="disabled" and reset with '
+                'disturbance="worst" needs a nominal trajectory for every episode, and an '
+                'autoreset starts one without: use autoreset_mode="disabled" and reset with '
                 'options={"nominal": ..., "reset_mask": ...}'
             )
         if self.nominal is not None:
@@ -355,16 +356,3 @@ class CartPoleVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.flo
         if nominal is not None:
             info["tracking_error"] = task.goal_distance(self._state.T, nominal.T, np.sqrt)
         return info
-
-
-def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    if isinstance(mode, AutoresetMode):
-        return mode
-    names = {
-        "next_step": AutoresetMode.NEXT_STEP,
-        "same_step": AutoresetMode.SAME_STEP,
-        "disabled": AutoresetMode.DISABLED,
-    }
-    if mode not in names:
-        raise ValueError(f"autoreset_mode={mode!r} must be one of {', '.join(names)}")
-    return names[mode]

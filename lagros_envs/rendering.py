@@ -46,7 +46,12 @@ PLOT_HEIGHT = 3.5  # shown at least, in units of the state norm
 PLOT = (262, 18, 240, 96)  # left, top, width, height of the plot over time [px]
 
 
-def _import_pygame() -> ModuleType:
+def import_pygame() -> ModuleType:
+    """Import pygame, without its greeting.
+
+    Raises:
+        ImportError: The extra `lagros[render]` is not installed.
+    """
     # A library has no business printing a greeting.
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:
@@ -58,7 +63,7 @@ def _import_pygame() -> ModuleType:
     return pygame
 
 
-def _mix(colour: Colour, share: float) -> Colour:
+def mix(colour: Colour, share: float) -> Colour:
     """Fade a colour towards white; a share of 1 leaves it as it is."""
     red, green, blue = (round(share * part + (1.0 - share) * 255) for part in colour)
     return red, green, blue
@@ -80,7 +85,7 @@ class CartPoleRenderer:
 
     def __init__(self, render_mode: str, fps: int) -> None:
         """Prepare a canvas, and a window in the mode "human"."""
-        library = self._pygame = _import_pygame()
+        library = self._pygame = import_pygame()
         self._fps = fps
         self._window: pygame.Surface | None = None
         self._clock: pygame.time.Clock | None = None
@@ -198,7 +203,7 @@ class CartPoleRenderer:
         rectangle = self._pygame.Rect(
             round(low[0]), top, max(1, round(high[0] - low[0])), round(low[1]) - top
         )
-        self._canvas.fill(_mix(colour, 0.3 if inside else 0.13), rectangle)
+        self._canvas.fill(mix(colour, 0.3 if inside else 0.13), rectangle)
         for edge in (low[0], high[0]):
             self._dashed((edge, top), (edge, low[1]), colour, 2)
         # The radius, as a dimension line from the goal.
@@ -207,7 +212,7 @@ class CartPoleRenderer:
         if high[0] - centre > 40 * OVERSAMPLING:
             self._arrow((centre, height), (high[0], height), colour, 1.5)
             middle = (0.5 * (centre + high[0]), height + 11 * OVERSAMPLING)
-            self._text("r(t)", middle, _mix(BLACK, 0.75), 17, anchor="center")
+            self._text("r(t)", middle, mix(BLACK, 0.75), 17, anchor="center")
         self._dashed((centre, top), (centre, low[1]), GREEN, 1.5)
 
     def _draw_cart_pole(
@@ -221,7 +226,7 @@ class CartPoleRenderer:
         body = pygame.Rect(0, 0, round(width), round(height))
         body.midbottom = (round(along), round(ground - wheel))
         if ghost:
-            faded = _mix(colour, 0.7)
+            faded = mix(colour, 0.7)
             pygame.draw.rect(
                 self._canvas, faded, body, width=2 * OVERSAMPLING, border_radius=round(height / 5)
             )
@@ -297,14 +302,14 @@ class CartPoleRenderer:
         left, right = 580 * OVERSAMPLING, 612 * OVERSAMPLING
         level = height * OVERSAMPLING
         if shape == "ghost":
-            self._dashed((left, level), (right, level), _mix(colour, 0.7), 4)
+            self._dashed((left, level), (right, level), mix(colour, 0.7), 4)
         elif shape == "arrow":
             self._arrow((left, level), (right, level), colour, 3)
         else:
             box = self._pygame.Rect(
                 left, round(level - 6 * OVERSAMPLING), right - left, 12 * OVERSAMPLING
             )
-            self._canvas.fill(_mix(colour, 0.3), box)
+            self._canvas.fill(mix(colour, 0.3), box)
         self._text(label, (right + 10 * OVERSAMPLING, level), BLACK, 17, anchor="midleft")
 
     def _draw_plot(self, time: float, distance: float, radius: float) -> None:
@@ -335,7 +340,7 @@ class CartPoleRenderer:
                 self._line(start, end, colour, 2)
             self._pygame.draw.circle(self._canvas, colour, points[-1], 3.5 * OVERSAMPLING)
             beside = (points[-1][0] + 8 * OVERSAMPLING, level)
-            self._text(name, beside, _mix(BLACK, 0.75), 17, anchor="midleft")
+            self._text(name, beside, mix(BLACK, 0.75), 17, anchor="midleft")
         below = top + height + 9 * OVERSAMPLING
         self._text("0", (left, below), GREY, 17, anchor="center")
         self._text(f"{latest:g} s", (left + width, below), GREY, 17, anchor="center")

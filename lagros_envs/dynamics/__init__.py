@@ -1,11 +1,12 @@
 """Equations of motion, written once, and what is derived from them.
 
-`cartpole` holds the physics; `dual` differentiates it; `integrate` holds a control over one step;
-`system` derives drift, control matrix, Jacobians and the SDC matrix for any system.
+`cartpole` and `spacecraft` hold the physics; `dual` differentiates it; `integrate` holds a control
+over one step; `system` derives drift, control matrix, Jacobians and the SDC matrix for any system.
 """
 
 from lagros_envs.dynamics.cartpole import CartPole
 from lagros_envs.dynamics.integrate import hold_control_slope, hold_step, linearise_hold
+from lagros_envs.dynamics.spacecraft import Spacecraft
 from lagros_envs.dynamics.system import (
     Components,
     Functions,
@@ -20,6 +21,7 @@ __all__ = [
     "CartPole",
     "Components",
     "Functions",
+    "Spacecraft",
     "System",
     "control_matrix",
     "hold_control_slope",

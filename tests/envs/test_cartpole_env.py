@@ -53,6 +53,8 @@ def test_gymnasium_checks_the_environment_without_a_warning(name):
 
 @pytest.mark.parametrize("name", IDS)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
+# Thrusters only push: their actions lie in [0, 1].
+@pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric")
 def test_stable_baselines3_checks_the_environment_without_a_warning(name):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     checker.check_env(gym.make(name, render_mode="rgb_array").unwrapped)

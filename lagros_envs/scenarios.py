@@ -1,0 +1,362 @@
+"""Random tasks for spacecraft: starts, goals and obstacles, with a way for every agent."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.files import write_atomic
+from lagros_envs.reachable import way_exists
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+FORMAT = "lagros-scenario-1"
+ATTEMPTS = 1000  # of a whole scenario, before the density is called impossible
+DRAWS = 16  # of one obstacle, start or goal at a time ...
+ROUNDS = 12  # ... and how often, before the attempt is given up
+GRID = 0.15  # cell of the grid on which a way is looked for [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """One task: who starts where, wants to go where, and what stands in between.
+
+    Attributes:
+        starts: Positions at the start, shape (n, 2) [m]; every agent starts at rest.
+        headings: phi at the start, shape (n,) [rad].
+        goals: Positions to reach, shape (n, 2) [m].
+        obstacles: Centres, shape (k, 2) [m].
+        obstacle_radii: Shape (k,) [m].
+        agent_radius: Two agents collide when their centres come closer than twice this [m].
+        core_radius: An agent collides with an obstacle when its centre comes closer to the
+            obstacle's rim than this [m]; None takes `agent_radius`.
+
+    Raises:
+        ValueError: A shape is wrong, a value is not finite, a radius is out of range, or agents
+            start in collision.
+    """
+
+    starts: FloatArray
+    headings: FloatArray
+    goals: FloatArray
+    obstacles: FloatArray
+    obstacle_radii: FloatArray
+    agent_radius: float = 0.25
+    core_radius: float | None = None
+
+    def __post_init__(self) -> None:
+        """Take read-only copies in double precision and check them."""
+        agents, obstacles = np.shape(self.starts)[0:1], np.shape(self.obstacle_radii)
+        shapes = {
+            "starts": (*agents, 2),
+            "headings": agents,
+            "goals": (*agents, 2),
+            "obstacles": (*obstacles, 2),
+            "obstacle_radii": obstacles,
+        }
+        for name, shape in shapes.items():
+            value = np.array(getattr(self, name), dtype=np.float64)
+            if name == "obstacles" and value.size == 0:
+                value = value.reshape(0, 2)
+            if value.shape != shape or not np.all(np.isfinite(value)):
+                raise ValueError(
+                    f"{name} has shape {value.shape}; it must be finite and of shape {shape}, for "
+                    f"{len(self.starts)} agents and {np.size(self.obstacle_radii)} obstacles"
+                )
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        if self.num_agents == 0:
+            raise ValueError("starts is empty; a scenario needs at least one agent")
+        if self.core_radius is None:
+            object.__setattr__(self, "core_radius", self.agent_radius)
+        if not (math.isfinite(self.agent_radius) and self.agent_radius > 0.0):
+            raise ValueError(f"agent_radius={self.agent_radius!r} must be finite and > 0")
+        if not (math.isfinite(self.core) and self.core >= 0.0):
+            raise ValueError(f"core_radius={self.core_radius!r} must be finite and >= 0, or None")
+        if np.any(self.obstacle_radii <= 0.0):
+            raise ValueError(f"obstacle_radii={self.obstacle_radii.tolist()} must be > 0")
+        self._check_starts()
+
+    @property
+    def num_agents(self) -> int:
+        """Number n of agents."""
+        return len(self.starts)
+
+    @property
+    def core(self) -> float:
+        """The agents' radius against obstacles [m]."""
+        return self.agent_radius if self.core_radius is None else self.core_radius
+
+    def _check_starts(self) -> None:
+        apart = np.linalg.norm(self.starts[:, None] - self.starts, axis=-1)
+        np.fill_diagonal(apart, np.inf)
+        first, second = np.unravel_index(np.argmin(apart), apart.shape)
+        if apart[first, second] < 2.0 * self.agent_radius:
+            raise ValueError(
+                f"agents {first} and {second} start {apart[first, second]:.3f} m apart; they need "
+                f"{2.0 * self.agent_radius:g} m"
+            )
+        gaps = np.linalg.norm(self.starts[:, None] - self.obstacles, axis=-1) - self.obstacle_radii
+        agents, obstacles = np.nonzero(gaps < self.core)
+        if agents.size:
+            raise ValueError(
+                f"agent {agents[0]} starts {gaps[agents[0], obstacles[0]]:.3f} m from the rim of "
+                f"obstacle {obstacles[0]}; it needs {self.core:g} m"
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the scenario as plain numbers and lists."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in values.items()
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write the scenario as JSON, atomically; numbers keep every bit."""
+        write_atomic(path, json.dumps({"format": FORMAT, **self.to_dict()}, indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Scenario:
+        """Read a scenario that `save` has written.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file is not a scenario, or describes one that cannot be.
+        """
+        try:
+            record = json.loads(Path(path).read_text(encoding="utf-8"))
+        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise ValueError(f"{path} is not JSON: {error}") from error
+        names = {item.name for item in fields(cls)}
+        if not isinstance(record, dict) or record.pop("format", None) != FORMAT:
+            raise ValueError(f'{path} is not a scenario: its "format" is not "{FORMAT}"')
+        if set(record) != names:
+            raise ValueError(
+                f"{path} has the entries {sorted(record)}; a scenario has {sorted(names)}"
+            )
+        return cls(**record)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A law from which scenarios are drawn.
+
+    Attributes:
+        agents: Number of agents unless another is asked for.
+        arena: Side of the square [0, arena]^2 in which everything is placed [m]; free outside.
+        obstacle_count: Fewest and most obstacles.
+        obstacle_radius: Radius of every obstacle [m].
+        agent_radius: As in `Scenario` [m].
+        core_radius: As in `Scenario` [m].
+        margin: Room that every start, goal and passage keeps beside the radii [m].
+        least_way: Least distance from a start to its goal [m].
+        heading_range: phi at the start is uniform in plus or minus this [rad].
+        open_passages: Whether an agent with its margin fits between any two obstacles.
+        layout: "random", or "antipodal": on a circle, each goal opposite to its start.
+        grows: Whether arena and obstacle count grow with the number of agents, at the density of
+            `agents`.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    agents: int = 6
+    arena: float = 5.0
+    obstacle_count: tuple[int, int] = (3, 6)
+    obstacle_radius: float = 0.5
+    agent_radius: float = 0.25
+    core_radius: float | None = None
+    margin: float = 0.15
+    least_way: float = 2.5
+    heading_range: float = math.pi
+    open_passages: bool = True
+    layout: Literal["random", "antipodal"] = "random"
+    grows: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name in ("arena", "obstacle_radius", "agent_radius"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name}={value!r} must be finite and > 0")
+        for name in ("core_radius", "margin", "least_way", "heading_range"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name}={value!r} must be finite and >= 0")
+        fewest, most = self.obstacle_count
+        if not 0 <= fewest <= most:
+            raise ValueError(f"obstacle_count={self.obstacle_count!r} must be 0 <= fewest <= most")
+        if self.agents < 1:
+            raise ValueError(f"agents={self.agents!r} must be at least 1")
+        if self.layout not in ("random", "antipodal"):
+            raise ValueError(f'layout={self.layout!r} must be "random" or "antipodal"')
+
+    def for_agents(self, num_agents: int | None = None) -> Preset:
+        """Return the preset with its sizes for this many agents.
+
+        Raises:
+            ValueError: The number is less than 1.
+        """
+        count = self.agents if num_agents is None else num_agents
+        if count < 1:
+            raise ValueError(f"num_agents={count!r} must be at least 1")
+        if not self.grows:
+            return replace(self, agents=count)
+        share = max(1.0, count / self.agents)
+        fewest, most = (round(share * number) for number in self.obstacle_count)
+        return replace(
+            self,
+            agents=count,
+            arena=self.arena * math.sqrt(share),
+            obstacle_count=(fewest, most),
+            grows=False,
+        )
+
+    def sample(self, rng: np.random.Generator, num_agents: int | None = None) -> Scenario:
+        """Draw a scenario in which every agent alone has a way to its goal.
+
+        Args:
+            rng: The scenario stream of the episode.
+            num_agents: Number of agents; None for the preset's own.
+
+        Returns:
+            The scenario.
+
+        Raises:
+            ValueError: No attempt met the density that is asked for.
+        """
+        preset = self.for_agents(num_agents)
+        for _ in range(ATTEMPTS):
+            scenario = _attempt(preset, rng)
+            if scenario is not None:
+                return scenario
+        raise ValueError(
+            f"no scenario with {preset.agents} agents and {preset.obstacle_count[0]} to "
+            f"{preset.obstacle_count[1]} obstacles in an arena of {preset.arena:g} m in {ATTEMPTS} "
+            f"attempts: use fewer agents or obstacles, a larger arena, or a smaller margin "
+            f"({preset.margin:g} m) or least_way ({preset.least_way:g} m)"
+        )
+
+
+PRESETS: dict[str, Preset] = {
+    "paper": Preset(),
+    # The authors' released code: centres of agents 1 m apart, agents that are points to obstacles,
+    # a planning margin of 0.125 m, starts facing along the axes.
+    "released": Preset(
+        obstacle_count=(6, 6),
+        agent_radius=0.5,
+        core_radius=0.0,
+        margin=0.125,
+        least_way=5.0,
+        heading_range=0.0,
+    ),
+    "crossing": Preset(obstacle_count=(0, 0), least_way=0.0, layout="antipodal"),
+    "open": Preset(obstacle_count=(0, 0)),
+    "swarm": Preset(grows=True),
+}
+
+
+def preset_named(preset: str | Preset) -> Preset:
+    """Return a preset by its name; a preset stays as it is.
+
+    Raises:
+        ValueError: The name is unknown.
+    """
+    if isinstance(preset, Preset):
+        return preset
+    if preset not in PRESETS:
+        raise ValueError(
+            f"preset={preset!r} is not known; use one of {', '.join(PRESETS)}, or a "
+            "lagros_envs.scenarios.Preset"
+        )
+    return PRESETS[preset]
+
+
+def _attempt(preset: Preset, rng: np.random.Generator) -> Scenario | None:
+    """Draw once; None if something found no place or a goal cannot be reached."""
+    core = preset.agent_radius if preset.core_radius is None else preset.core_radius
+    fewest, most = preset.obstacle_count
+    count = int(rng.integers(fewest, most, endpoint=True))
+    gap = 2.0 * (preset.obstacle_radius + (core + preset.margin if preset.open_passages else 0.0))
+    obstacles = _scatter(rng, preset.arena, count, gap)
+    if obstacles is None:
+        return None
+    clearance = preset.obstacle_radius + core + preset.margin
+    if preset.layout == "antipodal":
+        ends = _opposite_ends(preset, rng)
+        if not all(np.all(_clear(points, obstacles, clearance)) for points in ends):
+            return None
+    else:
+        found = _random_ends(preset, rng, obstacles, clearance)
+        if found is None:
+            return None
+        ends = found
+    starts, goals = ends
+    inflated = np.full(count, clearance)
+    if not way_exists(starts, goals, obstacles, inflated, GRID):
+        return None
+    headings = preset.heading_range * rng.uniform(-1.0, 1.0, preset.agents)
+    radii = np.full(count, preset.obstacle_radius)
+    return Scenario(
+        starts, headings, goals, obstacles, radii, preset.agent_radius, preset.core_radius
+    )
+
+
+def _scatter(rng: np.random.Generator, arena: float, count: int, apart: float) -> FloatArray | None:
+    """Place points one by one, `apart` from each other."""
+    placed = np.empty((count, 2))
+    for index in range(count):
+        for _ in range(ROUNDS):
+            draws = rng.uniform(0.0, arena, (DRAWS, 2))
+            fits = _clear(draws, placed[:index], apart)
+            if fits.any():
+                placed[index] = draws[np.argmax(fits)]
+                break
+        else:
+            return None
+    return placed
+
+
+def _random_ends(
+    preset: Preset, rng: np.random.Generator, obstacles: FloatArray, clearance: float
+) -> tuple[FloatArray, FloatArray] | None:
+    apart = 2.0 * (preset.agent_radius + preset.margin)
+    starts = np.empty((preset.agents, 2))
+    goals = np.empty((preset.agents, 2))
+    for agent in range(preset.agents):
+        for _ in range(ROUNDS):
+            draws = rng.uniform(0.0, preset.arena, (2, DRAWS, 2))
+            fits = np.sum((draws[0] - draws[1]) ** 2, axis=-1) >= preset.least_way**2
+            for ends, points in zip((starts, goals), draws, strict=True):
+                fits &= _clear(points, obstacles, clearance) & _clear(points, ends[:agent], apart)
+            if fits.any():
+                starts[agent], goals[agent] = draws[:, np.argmax(fits)]
+                break
+        else:
+            return None
+    return starts, goals
+
+
+def _opposite_ends(preset: Preset, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Place the agents on a circle in the middle of the arena, wide enough for all of them."""
+    apart = 2.0 * (preset.agent_radius + preset.margin)
+    least = 0.5 * apart / math.sin(math.pi / preset.agents) if preset.agents > 1 else 0.0
+    radius = max(0.5 * preset.arena - preset.agent_radius - preset.margin, least)
+    angles = 2.0 * math.pi * (rng.random() + np.arange(preset.agents) / preset.agents)
+    arms = radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    middle = np.full(2, 0.5 * preset.arena)
+    return middle + arms, middle - arms
+
+
+def _clear(points: FloatArray, others: FloatArray, distance: float) -> BoolArray:
+    """Tell which points (p, 2) keep the distance to all the others (q, 2)."""
+    squares = np.sum((points[:, None] - others) ** 2, axis=-1)
+    return cast(BoolArray, np.all(squares >= distance**2, axis=1))

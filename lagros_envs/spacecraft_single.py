@@ -1,0 +1,151 @@
+"""`lagros/Spacecraft-v0`: one spacecraft among obstacles, as a Gymnasium environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from lagros_envs import spacecraft_task as task
+from lagros_envs.observation import observe
+from lagros_envs.scenarios import Preset, Scenario
+from lagros_envs.spacecraft_episode import (
+    RENDER_MODES,
+    SpacecraftDrawing,
+    SpacecraftEpisode,
+    action_space,
+    check_render_mode,
+    one_info,
+)
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+
+
+class SpacecraftEnv(SpacecraftDrawing, gym.Env[Float32Array, Float32Array]):
+    """One spacecraft that seeks its goal among obstacles, under bounded disturbance.
+
+    The world, action, observation, reward and info of `spacecraft.SpacecraftParallelEnv` with a
+    single agent: the one slot for a neighbour is always empty. `terminated` at a collision,
+    `truncated` at 45 s; the episode goes on after the arrival.
+
+    `reset(options=...)` takes `scenario`, a `lagros_envs.scenarios.Scenario` of one agent, and
+    `nominal`, x_d at every control instant, shape (steps + 1, 6).
+
+    Args:
+        preset: As in `SpacecraftParallelEnv`.
+        disturbance: As in `SpacecraftParallelEnv`.
+        disturbance_bound: As in `SpacecraftParallelEnv`.
+        disturbance_channels: As in `SpacecraftParallelEnv`.
+        metric: As in `SpacecraftParallelEnv`.
+        settings: The task.
+        render_mode: None, "human" or "rgb_array".
+
+    Raises:
+        ValueError: A setting is not valid.
+    """
+
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}
+
+    def __init__(
+        self,
+        preset: str | Preset = "paper",
+        disturbance: str | Any = "none",
+        disturbance_bound: float = 0.4,
+        disturbance_channels: Literal["all", "rates"] | Sequence[bool] = "all",
+        metric: Any = None,
+        settings: task.SpacecraftSettings | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """Build the environment; see the class for the arguments."""
+        self.render_mode = check_render_mode(render_mode)
+        self.episode = SpacecraftEpisode(
+            1, preset, disturbance, disturbance_bound, disturbance_channels, metric, settings
+        )
+        self.settings, self.preset = self.episode.settings, self.episode.preset
+        self.disturbance = self.episode.disturbance
+        self.named_space = self.episode.layout.named_space
+        self.observation_space = cast(
+            "spaces.Space[Float32Array]", spaces.flatten_space(self.named_space)
+        )
+        self.action_space = cast("spaces.Space[Float32Array]", action_space())
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float32Array, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seed of the episode; the scenario and the disturbance have a stream each.
+            options: `scenario` and `nominal`, see the class.
+
+        Returns:
+            The observation and the info.
+
+        Raises:
+            ValueError: An option has a wrong type, shape or value.
+        """
+        super().reset(seed=seed)
+        if seed is None:
+            seed = int(self.np_random.integers(2**63))
+        options = dict(options or {})
+        nominal = options.get("nominal")
+        if nominal is not None and np.ndim(nominal) == 2:
+            options["nominal"] = np.asarray(nominal)[:, None]
+        self.episode.start(seed, options)
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), self._info()
+
+    def step(self, action: Float32Array) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
+        """Hold the thrust for one control step.
+
+        Args:
+            action: Thrust in units of `settings.thrust_scale`, shape (8,).
+
+        Returns:
+            Observation, reward, terminated, truncated, info.
+
+        Raises:
+            ValueError: The action is not eight finite numbers.
+            RuntimeError: The environment was not reset.
+        """
+        self.episode.need_start()
+        values = task.checked_actions(action, (task.THRUSTERS,))
+        forces = task.applied_forces(self.settings, values)
+        outcome = self.episode.world.step(forces[None, None])
+        if self.render_mode == "human":
+            self.render()
+        return (
+            self._observation(),
+            float(outcome.reward[0, 0]),
+            bool(outcome.terminated[0, 0]),
+            bool(outcome.truncated[0, 0]),
+            self._info(),
+        )
+
+    @property
+    def state(self) -> FloatArray:
+        """The state x in double precision, shape (6,)."""
+        return cast(FloatArray, self.episode.world.states[0, 0])
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of the episode."""
+        self.episode.need_start()
+        return cast(Scenario, self.episode.world.scenarios[0])
+
+    @property
+    def time(self) -> float:
+        """The time t [s]."""
+        return float(self.episode.world.time[0])
+
+    def _observation(self) -> Float32Array:
+        return cast(Float32Array, observe(self.episode.world, self.episode.layout)[0, 0])
+
+    def _info(self) -> dict[str, Any]:
+        return one_info(self.episode.world.info(), 0)

@@ -1,0 +1,196 @@
+"""The spacecraft task of the paper: settings, forces and rewards.
+
+Every definition works on arrays of any leading shape, so that one agent and many worlds share it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.dynamics.spacecraft import Spacecraft
+from lagros_envs.tube import PaperTube
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+STATE_DIM = 6
+THRUSTERS = 8
+RATES = (False, False, False, True, True, True)
+# Beyond this, in units of the state, the integration has diverged under an enormous force.
+LARGEST_STATE = 1e12
+# No force is larger [N], whatever the action: its square, the effort, stays a number.
+LARGEST_FORCE = 1e100
+
+
+@dataclass(frozen=True)
+class SpacecraftSettings:
+    """Everything that defines the task except the scenario, with the values of the paper.
+
+    Attributes:
+        system: The spacecraft.
+        control_period: Zero-order hold, the largest admissible control interval [s].
+        horizon: T, nominal duration of a plan [s].
+        time_limit: The end of an episode [s].
+        sensing_radius: How far an agent senses [m].
+        goal_radius: Distance from the goal at which an agent has arrived [m].
+        tube: The published tube; its radius is the threshold of `paper_success`.
+        thrust_scale: Force of the action 1.0 of one thruster [N].
+        thrust_limit: Saturation of one thruster [N]; None leaves it unlimited, and actions beyond 1
+            are applied as they are. Thrusters cannot pull: negative actions count as zero.
+        progress_weight: Reward per metre of approach to the goal.
+        effort_weight: Reward per N^2 s of effort, negative sign applied.
+        success_bonus: Reward at the first success.
+        collision_penalty: Reward at the first collision, negative sign applied.
+
+    Raises:
+        ValueError: A value is out of range or a duration is not a whole number of periods.
+    """
+
+    system: Spacecraft = field(default_factory=Spacecraft)
+    control_period: float = 0.1
+    horizon: float = 30.0
+    time_limit: float = 45.0
+    sensing_radius: float = 2.0
+    goal_radius: float = 0.2
+    tube: PaperTube = field(default_factory=lambda: PaperTube(0.125, 0.3))
+    thrust_scale: float = 1.0
+    thrust_limit: float | None = None
+    progress_weight: float = 1.0
+    effort_weight: float = 0.02
+    success_bonus: float = 5.0
+    collision_penalty: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, int | float) and not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{item.name}={value!r} must be finite and >= 0")
+        for name in ("control_period", "horizon", "time_limit", "goal_radius", "thrust_scale"):
+            if getattr(self, name) == 0.0:
+                raise ValueError(f"{name}=0.0 must be > 0")
+        if self.thrust_limit == 0.0:
+            raise ValueError("thrust_limit=0.0 must be > 0, or None for no limit")
+        for name in ("horizon", "time_limit"):
+            periods = getattr(self, name) / self.control_period
+            if abs(periods - round(periods)) > 1e-6:
+                raise ValueError(
+                    f"{name}={getattr(self, name)!r} must be a whole number of "
+                    f"control_period={self.control_period!r}"
+                )
+
+    @property
+    def steps(self) -> int:
+        """Control steps of an episode that runs to its limit."""
+        return round(self.time_limit / self.control_period)
+
+
+def limited(settings: SpacecraftSettings, steps: int | None) -> SpacecraftSettings:
+    """Return the settings with an episode of this many control steps; None leaves them.
+
+    Raises:
+        ValueError: The number is less than 1.
+    """
+    if steps is None:
+        return settings
+    if steps < 1:
+        raise ValueError(f"max_cycles={steps!r} must be at least 1, or None for the time limit")
+    return replace(settings, time_limit=steps * settings.control_period)
+
+
+def applied_forces(settings: SpacecraftSettings, actions: Any) -> FloatArray:
+    """Return the forces of the thrusters [N], of the actions' shape: scaled, then clipped."""
+    with np.errstate(over="ignore"):
+        forces = settings.thrust_scale * np.asarray(actions, dtype=np.float64)
+    limit = settings.thrust_limit
+    return np.clip(forces, 0.0, LARGEST_FORCE if limit is None else limit)
+
+
+def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[np.floating[Any]]:
+    """Return the actions as an array.
+
+    Args:
+        actions: What a user passed to step.
+        shape: The shape that they must have; the last axis is that of the thrusters.
+
+    Returns:
+        The actions.
+
+    Raises:
+        ValueError: They have another shape or are not finite.
+    """
+    values = np.asarray(actions)
+    if values.shape != shape or values.dtype.kind not in "fiu":
+        raise ValueError(
+            f"the action has shape {values.shape} and type {values.dtype}; it must be numbers of "
+            f"shape {shape}, one per thruster"
+        )
+    if not np.all(np.isfinite(values)):
+        rows = np.unique(np.nonzero(~np.isfinite(values))[0]).tolist()
+        where = f" in the rows {rows}" if values.ndim > 1 else ""
+        raise ValueError(f"the action is not finite{where}; every thruster needs a finite number")
+    return values
+
+
+def nominal_from_options(
+    options: dict[str, Any], settings: SpacecraftSettings, batch: tuple[int, ...]
+) -> FloatArray | None:
+    """Return x_d of every agent at every control instant, if the options hold it.
+
+    Args:
+        options: As given to reset.
+        settings: The task.
+        batch: Leading axes, then the number of agents.
+
+    Returns:
+        Shape (*leading, steps + 1, agents, 6), or None.
+
+    Raises:
+        ValueError: The trajectory has the wrong shape or is not finite.
+    """
+    value = options.get("nominal")
+    if value is None:
+        return None
+    nominal = np.array(value, dtype=np.float64)
+    *leading, agents = batch
+    wanted = (*leading, settings.steps + 1, agents, STATE_DIM)
+    if nominal.shape != wanted or not np.all(np.isfinite(nominal)):
+        raise ValueError(
+            f"options['nominal'] has shape {nominal.shape}; it must be finite and of shape "
+            f"{wanted}, the nominal state of every agent at every control instant"
+        )
+    return nominal
+
+
+def reward(
+    settings: SpacecraftSettings,
+    effort: FloatArray,
+    approach: FloatArray,
+    first_success: BoolArray,
+    first_collision: BoolArray,
+) -> FloatArray:
+    """Return each agent's reward of one control step.
+
+    Args:
+        settings: The task.
+        effort: ||u||^2 dt of the step [N^2 s].
+        approach: How much closer to its goal the step brought the agent [m].
+        first_success: Whether the step brought the first success.
+        first_collision: Whether the step brought the first collision.
+
+    Returns:
+        w_p approach - w_e ||u||^2 dt + b_s [first success] - b_c [first collision]. Approach adds
+        up to the way made good, so that neither hurrying nor dithering pays.
+    """
+    rewards: FloatArray = (
+        settings.progress_weight * approach
+        - settings.effort_weight * effort
+        + settings.success_bonus * first_success
+        - settings.collision_penalty * first_collision
+    )
+    return rewards

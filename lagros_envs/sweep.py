@@ -1,0 +1,109 @@
+"""Collisions between control instants: the closest approach of pieces of straight motion."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+class Path(NamedTuple):
+    """How agents moved over one control step.
+
+    Attributes:
+        points: Positions at the ends of the substeps, shape (substeps + 1, 2, worlds, agents) [m].
+        bulge: How far the true path may leave the straight pieces, shape (worlds, agents) [m].
+        reach: Furthest that the path gets from its end, shape (worlds, agents) [m].
+    """
+
+    points: FloatArray
+    bulge: FloatArray
+    reach: FloatArray
+
+    @classmethod
+    def through(cls, points: FloatArray, bulge: FloatArray) -> Path:
+        """Return the path through these points."""
+        offsets = points[:-1] - points[-1]
+        squares = offsets[:, 0] * offsets[:, 0] + offsets[:, 1] * offsets[:, 1]
+        return cls(points, bulge, np.sqrt(np.max(squares, axis=0)) + bulge)
+
+
+def swept_agents(path: Path, contact: FloatArray) -> BoolArray:
+    """Tell which agents came too close to another agent of their world on the way.
+
+    Args:
+        path: How the agents moved.
+        contact: Distance of centres at which two agents of a world touch, shape (worlds,) [m].
+
+    Returns:
+        Shape (worlds, agents). The bulge of the paths counts as contact: a pass that is closer than
+        the straight pieces tell is never missed.
+    """
+    points, bulge, reach = path
+    worlds, agents = bulge.shape
+    hit = np.zeros((worlds, agents), bool)
+    if agents == 1:
+        return hit
+    first, second = np.triu_indices(agents, 1)
+    x, y = points[-1]
+    # Who is further apart at the end than both have moved and need cannot have met.
+    square = (x[:, second] - x[:, first]) ** 2 + (y[:, second] - y[:, first]) ** 2
+    near = square <= (reach[:, first] + reach[:, second] + contact[:, None]) ** 2
+    world, pair = np.nonzero(near)
+    if world.size:
+        one, other = first[pair], second[pair]
+        offsets = points[:, :, world, other] - points[:, :, world, one]
+        limit = contact[world] + bulge[world, one] + bulge[world, other]
+        met = closest_approach(offsets) < limit
+        hit[world[met], one[met]] = True
+        hit[world[met], other[met]] = True
+    return hit
+
+
+def swept_obstacles(path: Path, centres: FloatArray, contact: FloatArray) -> BoolArray:
+    """Tell which agents came too close to an obstacle on the way.
+
+    Args:
+        path: How the agents moved.
+        centres: Of the obstacles, shape (2, worlds, obstacles) [m].
+        contact: Distance of centres at which an agent touches, shape (worlds, obstacles) [m];
+            negative where there is no obstacle.
+
+    Returns:
+        Shape (worlds, agents).
+    """
+    points, bulge, reach = path
+    hit = np.zeros(bulge.shape, bool)
+    x, y = points[-1]
+    square = (x[:, :, None] - centres[0, :, None]) ** 2
+    square += (y[:, :, None] - centres[1, :, None]) ** 2
+    # An absent obstacle has the contact -inf; its square must not count.
+    limit = reach[:, :, None] + contact[:, None]
+    world, agent, obstacle = np.nonzero(square <= np.square(np.maximum(limit, 0.0)))
+    if world.size:
+        offsets = points[:, :, world, agent] - centres[:, world, obstacle]
+        met = closest_approach(offsets) < contact[world, obstacle] + bulge[world, agent]
+        hit[world[met], agent[met]] = True
+    return hit
+
+
+def closest_approach(offsets: FloatArray) -> FloatArray:
+    """Return the least distance from the origin of polylines.
+
+    Args:
+        offsets: Corners, shape (corners, 2, ...).
+
+    Returns:
+        Shape (...).
+    """
+    start, way = offsets[:-1], np.diff(offsets, axis=0)
+    length = np.einsum("sc...,sc...->s...", way, way)
+    along = -np.einsum("sc...,sc...->s...", start, way)
+    share = np.clip(along / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
+    nearest = start + share[:, None] * way
+    least: FloatArray = np.min(np.hypot(nearest[:, 0], nearest[:, 1]), axis=0)
+    return least

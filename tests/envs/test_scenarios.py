@@ -1,0 +1,261 @@
+"""Scenarios: what the presets promise, files, and refusals."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lagros_envs.reachable import flood, way_exists
+from lagros_envs.scenarios import PRESETS, Preset, Scenario, preset_named
+from lagros_envs.seeding import episode_streams
+
+
+def drawn(preset, agents=None, seeds=range(25)):
+    return [preset_named(preset).sample(episode_streams(seed).scenario, agents) for seed in seeds]
+
+
+def apart(points, others=None):
+    """Distances of all pairs; of different points if there is one set."""
+    distances = np.linalg.norm(points[:, None] - (points if others is None else others), axis=-1)
+    return distances[np.triu_indices(len(points), 1)] if others is None else distances
+
+
+def scenario(**changes):
+    values = {
+        "starts": [[0.0, 0.0], [1.0, 0.0]],
+        "headings": [0.0, 1.0],
+        "goals": [[3.0, 0.0], [3.0, 1.0]],
+        "obstacles": [[2.0, 2.0]],
+        "obstacle_radii": [0.5],
+    }
+    return Scenario(**{**values, **changes})
+
+
+# The presets.
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_samples_what_it_promises(name):
+    preset = PRESETS[name]
+    for sample in drawn(name):
+        assert sample.num_agents == 6
+        assert preset.obstacle_count[0] <= len(sample.obstacles) <= preset.obstacle_count[1]
+        assert np.all(np.linalg.norm(sample.starts - sample.goals, axis=1) >= preset.least_way)
+        room = 2.0 * (sample.agent_radius + preset.margin)
+        assert np.all(apart(sample.starts) >= room - 1e-12)
+        assert np.all(apart(sample.goals) >= room - 1e-12)
+        clearance = preset.obstacle_radius + sample.core + preset.margin
+        for ends in (sample.starts, sample.goals):
+            assert np.all(apart(ends, sample.obstacles) >= clearance)
+            assert np.all((ends >= 0.0) & (ends <= preset.arena))
+        assert np.all((sample.obstacles >= 0.0) & (sample.obstacles <= preset.arena))
+        # An agent with its margin fits between any two obstacles.
+        if len(sample.obstacles) > 1:
+            assert np.min(apart(sample.obstacles)) >= 2.0 * clearance
+        assert np.all(np.abs(sample.headings) <= preset.heading_range)
+
+
+def test_the_presets_are_those_of_the_issue():
+    paper, released = drawn("paper", seeds=range(60)), drawn("released", seeds=range(5))
+    assert {len(sample.obstacles) for sample in paper} == {3, 4, 5, 6}
+    assert all(sample.agent_radius == 0.25 and sample.core == 0.25 for sample in paper)
+    assert np.ptp([sample.headings[0] for sample in paper]) > 5.0
+    for sample in released:
+        assert 2.0 * sample.agent_radius == 1.0
+        assert len(sample.obstacles) == 6
+        assert np.all(np.linalg.norm(sample.starts - sample.goals, axis=1) > 5.0)
+        assert not sample.headings.any()
+    for sample in (*drawn("open"), *drawn("crossing")):
+        assert sample.obstacles.shape == (0, 2)
+
+
+@pytest.mark.parametrize("agents", [1, 2, 6, 17])
+def test_crossing_swaps_opposite_places(agents):
+    for sample in drawn("crossing", agents, range(5)):
+        middle = np.full(2, 2.5)
+        np.testing.assert_allclose(sample.starts + sample.goals, 2.0 * middle + 0 * sample.starts)
+        radii = np.linalg.norm(sample.starts - middle, axis=1)
+        np.testing.assert_allclose(radii, radii[0])
+        if agents > 1:
+            assert np.min(apart(sample.starts)) >= 0.8 - 1e-9
+
+
+@pytest.mark.parametrize("agents", [1, 6, 12, 64])
+def test_a_swarm_grows_at_its_density(agents):
+    preset = PRESETS["swarm"].for_agents(agents)
+    share = max(1.0, agents / 6)
+    assert preset.arena**2 == pytest.approx(25.0 * share)
+    assert preset.obstacle_count == (round(3 * share), round(6 * share))
+    (sample,) = drawn("swarm", agents, [0])
+    assert sample.num_agents == agents
+    assert np.min(apart(sample.starts), initial=9.0) >= 0.8
+    assert np.max(sample.starts) <= preset.arena
+
+
+def test_every_sample_has_ways_around_the_inflated_obstacles():
+    """Fifteen draws of this law, of which three more would wall an agent in."""
+    closed = dataclasses.replace(
+        PRESETS["paper"],
+        open_passages=False,
+        obstacle_count=(14, 14),
+        arena=4.0,
+        obstacle_radius=0.3,
+        agent_radius=0.15,
+        margin=0.1,
+        least_way=2.0,
+    )
+    for seed in range(15):
+        sample = closed.sample(np.random.default_rng(seed), 4)
+        assert np.min(apart(sample.obstacles)) < 1.1  # the passages alone do not tell
+        inflated = np.full(14, 0.3 + 0.15 + 0.1)
+        args = (sample.starts, sample.goals, sample.obstacles, inflated)
+        assert way_exists(*args, cell=0.15)
+
+
+def test_a_density_that_cannot_be_met_is_refused():
+    with pytest.raises(ValueError, match=r"no scenario with 40 agents .* fewer agents"):
+        dataclasses.replace(PRESETS["paper"], margin=0.3).sample(np.random.default_rng(0), 40)
+
+
+def test_the_same_stream_gives_the_same_scenario():
+    for name in PRESETS:
+        first, second = drawn(name, seeds=[7, 7])
+        assert first.to_dict() == second.to_dict()
+        (other,) = drawn(name, seeds=[8])
+        assert first.to_dict() != other.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"arena": 0.0}, "arena=0.0"),
+        ({"margin": -0.1}, "margin=-0.1"),
+        ({"obstacle_count": (4, 3)}, r"obstacle_count=\(4, 3\)"),
+        ({"agents": 0}, "agents=0"),
+        ({"layout": "ring"}, "layout='ring'"),
+        ({"least_way": math.inf}, "least_way=inf"),
+    ],
+)
+def test_presets_that_make_no_sense_are_refused(values, message):
+    with pytest.raises(ValueError, match=message):
+        Preset(**values)
+
+
+def test_unknown_names_and_numbers_are_refused():
+    with pytest.raises(ValueError, match=r"preset='papers' is not known; use one of paper, rel"):
+        preset_named("papers")
+    with pytest.raises(ValueError, match="num_agents=0 must be at least 1"):
+        PRESETS["paper"].for_agents(0)
+
+
+# Ways.
+
+
+def ring(count, radius, opening=0):
+    angles = 2.0 * math.pi * np.arange(count - opening) / count
+    return radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+
+
+@pytest.mark.parametrize(("opening", "found"), [(0, False), (3, True)])
+def test_an_agent_that_is_walled_in_has_no_way(opening, found):
+    wall = ring(12, 2.0, opening)
+    radii = np.full(len(wall), 0.55)
+    inside, outside = np.array([[0.1, 0.0]]), np.array([[4.0, 3.0]])
+    assert way_exists(inside, outside, wall, radii, 0.1) is found
+    assert way_exists(outside, inside, wall, radii, 0.1) is found
+    # Both in the same pocket.
+    assert way_exists(inside, np.array([[-0.5, 0.2]]), wall, radii, 0.1)
+    # One agent without a way is enough to refuse.
+    both = np.concatenate([outside, inside])
+    assert way_exists(both, np.array([[5.0, 5.0], [4.0, 4.0]]), wall, radii, 0.1) is found
+
+
+@given(st.integers(0, 2**32), st.floats(0.2, 0.8))
+def test_flooding_finds_what_a_search_finds(seed, density):
+    free = np.random.default_rng(seed).random((9, 14)) > density
+    free[2, 3] = True
+    stack, found = [(2, 3)], set()
+    while stack:
+        row, column = cell = stack.pop()
+        if 0 <= row < 9 and 0 <= column < 14 and free[cell] and cell not in found:
+            found.add(cell)
+            stack += [(row + 1, column), (row - 1, column), (row, column + 1), (row, column - 1)]
+    reached = flood(free, (2, 3))
+    assert {tuple(cell) for cell in np.argwhere(reached)} == found
+
+
+# One scenario.
+
+
+def test_a_scenario_round_trips_through_json(tmp_path):
+    for name in PRESETS:
+        (first,) = drawn(name, seeds=[3])
+        path = tmp_path / "sub" / f"{name}.json"
+        first.save(path)
+        second = Scenario.load(path)
+        for field in dataclasses.fields(Scenario):
+            ours, theirs = (getattr(sample, field.name) for sample in (first, second))
+            np.testing.assert_array_equal(ours, theirs)
+        assert [file.name for file in path.parent.glob(f"*{name}*")] == [path.name]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "is not JSON"),
+        ("[]", "is not a scenario"),
+        ('{"format": "other"}', "is not a scenario"),
+        ('{"format": "lagros-scenario-1", "starts": []}', r"has the entries \['starts'\]"),
+    ],
+)
+def test_files_that_are_no_scenario_are_refused(tmp_path, text, message):
+    path = tmp_path / "bad.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        Scenario.load(path)
+
+
+def test_a_scenario_with_a_nan_is_refused_when_read(tmp_path):
+    path = tmp_path / "nan.json"
+    scenario().save(path)
+    record = json.loads(path.read_text())
+    record["goals"][0][0] = math.nan
+    path.write_text(json.dumps(record))
+    with pytest.raises(ValueError, match="goals"):
+        Scenario.load(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"goals": [[3.0, 0.0]]}, r"goals has shape \(1, 2\).*\(2, 2\)"),
+        ({"headings": [0.0]}, "headings has shape"),
+        ({"obstacles": [[2.0, math.nan]]}, "obstacles has shape .* finite"),
+        ({"obstacle_radii": [0.5, 0.5]}, "obstacles has shape"),
+        ({"obstacle_radii": [0.0]}, r"obstacle_radii=\[0.0\] must be > 0"),
+        ({"agent_radius": 0.0}, "agent_radius=0.0"),
+        ({"core_radius": -1.0}, "core_radius=-1.0"),
+        ({"starts": [[0.0, 0.0], [0.4, 0.0]]}, r"agents 0 and 1 start 0.400 m apart.* 0.5 m"),
+        ({"starts": [[0.0, 0.0], [2.0, 1.3]]}, "agent 1 starts 0.200 m from .* obstacle 0"),
+        (
+            {"starts": [], "headings": [], "goals": []},
+            "starts",
+        ),
+    ],
+)
+def test_scenarios_that_cannot_be_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        scenario(**changes)
+
+
+def test_a_scenario_keeps_its_own_read_only_copies():
+    starts = np.array([[0.0, 0.0], [1.0, 0.0]])
+    made = scenario(starts=starts)
+    starts[:] = 9.0
+    assert made.starts[1, 0] == 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        made.starts[0, 0] = 5.0
