@@ -31,10 +31,10 @@ from rich.table import Table
 from lagros_envs import cartpole_task as task
 from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.dynamics import hold_step
+from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_policies.contraction import InfeasibleError, Metric, robust_control
 from lagros_policies.expert import CartPoleExpert, TrackedPlans
-from lagros_envs.files import write_atomic
 from lagros_policies.metric_design import MetricDesignSettings, design_cartpole_metric
 
 FloatArray = NDArray[np.float64]
