@@ -28,17 +28,17 @@ FloatArray = NDArray[np.float64]
 Solver = Callable[[QuadraticProgram], QpSolution]
 
 # The default of ScpSettings.
-_TOLERANCE = 1e-8
+TOLERANCE = 1e-8
 _MOST_ITERATIONS = 50_000
 
 
 def solvers() -> dict[str, Solver]:
     """Return the candidates by name, the one in use first."""
     return {
-        "PIQP (in use)": lambda program: solve_with_piqp(program, _TOLERANCE),
+        "PIQP (in use)": lambda program: solve_with_piqp(program, TOLERANCE),
         "PIQP, workspace kept": KeptPiqp(),
         "PIQP, multistage": solve_with_multistage,
-        "Clarabel": lambda program: solve_with_clarabel(program, _TOLERANCE),
+        "Clarabel": lambda program: solve_with_clarabel(program, TOLERANCE),
         "OSQP 1e-4": lambda program: solve_with_osqp(program, 1e-4),
         "OSQP 1e-6": lambda program: solve_with_osqp(program, 1e-6),
         "OSQP 1e-4, workspace kept": KeptOsqp(1e-4),
@@ -138,7 +138,7 @@ def _diagonal(program: QuadraticProgram) -> sparse.csc_matrix:
 
 def _piqp() -> Any:
     solver = piqp.SparseSolver()
-    solver.settings.eps_abs = solver.settings.eps_rel = _TOLERANCE
+    solver.settings.eps_abs = solver.settings.eps_rel = TOLERANCE
     solver.settings.check_duality_gap = False
     return solver
 

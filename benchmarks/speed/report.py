@@ -11,16 +11,18 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from lagros_policies.files import write_atomic
+from lagros_envs.files import write_atomic
 from speed.timing import Times
 
 WIDTH = 80
 # Above this load another process competes for a core of the two that this project is measured on.
 QUIET_LOAD = 1.2
+_UNITS = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6))
 _PEERS = ("casadi", "cvxpy", "onnxruntime")
 
 
@@ -79,12 +81,14 @@ class Section:
         rows: Lines.
         targets: Numbers to reach.
         notes: What the reader must know to read the lines.
+        tails: Whether the table shows the 99th percentiles; the JSON file always has them.
     """
 
     title: str
     rows: Sequence[Row]
     targets: Sequence[Target] = ()
     notes: Sequence[str] = ()
+    tails: bool = False
 
 
 def timed_row(
@@ -92,9 +96,10 @@ def timed_row(
 ) -> Row:
     """Return the row of a candidate; its ratio is to the reference."""
     ratio = None if reference is None else times.ratio_to(reference)
-    return Row(
-        label, times.median, times.p99, ratio, remark, {"calls": int(times.seconds.size), **facts}
-    )
+    counted: dict[str, Any] = {"rounds": int(times.seconds.size)}
+    if times.cpu_seconds is not None:
+        counted["cpu_median_s"] = float(np.median(times.cpu_seconds))
+    return Row(label, times.median, times.p99, ratio, remark, {**counted, **facts})
 
 
 def absent_row(label: str, package: str) -> Row:
@@ -106,9 +111,9 @@ def duration(seconds: float | None) -> str:
     """Return a time with three significant digits and its unit; nothing for None."""
     if seconds is None:
         return ""
-    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
-        if seconds >= 0.9995 * size:
-            break
+    unit, size = next(
+        ((unit, size) for unit, size in _UNITS if seconds >= 0.9995 * size), _UNITS[-1]
+    )
     value = seconds / size
     digits = 2 if value < 9.995 else 1 if value < 99.95 else 0
     return f"{value:.{digits}f} {unit}"
@@ -158,14 +163,16 @@ def print_section(console: Console, section: Section) -> None:
     table = Table(
         title=section.title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, width=WIDTH
     )
-    table.add_column("", ratio=5)
-    table.add_column("median", justify="right", no_wrap=True, min_width=7)
-    table.add_column("p99", justify="right", no_wrap=True, min_width=7)
-    table.add_column("ratio", justify="right", no_wrap=True, min_width=5)
-    table.add_column("", ratio=4)
+    table.add_column("", no_wrap=True)
+    table.add_column("median", justify="right", no_wrap=True)
+    if section.tails:
+        table.add_column("p99", justify="right", no_wrap=True)
+    table.add_column("ratio", justify="right", no_wrap=True)
+    table.add_column("", ratio=1)
     for row in section.rows:
         ratio = "" if row.ratio is None else f"{row.ratio:.3g}"
-        table.add_row(row.label, duration(row.median_s), duration(row.p99_s), ratio, row.remark)
+        times = [row.median_s, row.p99_s] if section.tails else [row.median_s]
+        table.add_row(row.label, *map(duration, times), ratio, row.remark)
     console.print()
     console.print(table)
     for note in section.notes:

@@ -32,6 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sys.path[:] = [str(HERE.parent), *(entry for entry in sys.path if entry != str(HERE))]
 
     from rich.console import Console
+
     from speed import report, timing
 
     console = Console(width=report.WIDTH, highlight=False)

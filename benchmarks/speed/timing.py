@@ -33,7 +33,7 @@ class Scale:
     """
 
     steps: int = 90
-    plans: int = 60
+    plans: int = 100
     episodes: int = 1000
     samples: tuple[int, ...] = (50, 200)
     designs: int = 5
@@ -55,11 +55,14 @@ class Times:
         seconds: Time of one call, one entry per round [s].
         results: What the last call of each round returned.
         single: Whether each entry is one call and not the mean of several.
+        cpu_seconds: Processor time of one call, over all threads [s]: what the clock would show if
+            no other process ran. None where it was not measured.
     """
 
     seconds: FloatArray
     results: list[Any]
     single: bool = True
+    cpu_seconds: FloatArray | None = None
 
     @property
     def median(self) -> float:
@@ -94,25 +97,29 @@ def interleave(
         The times of each candidate.
     """
     seconds: dict[str, list[float]] = {name: [] for name in candidates}
+    cpu_seconds: dict[str, list[float]] = {name: [] for name in candidates}
     results: dict[str, list[Any]] = {name: [] for name in candidates}
     if warm_up:
         for candidate in candidates.values():
             candidate(0)
-    clock = time.perf_counter
+    clock, cpu_clock = time.perf_counter, time.process_time
     gc.collect()
     # As in timeit: the collector would charge one candidate for the litter of another.
     gc.disable()
     try:
         for index in range(rounds):
             for name, candidate in candidates.items():
-                begun = clock()
+                cpu_begun, begun = cpu_clock(), clock()
                 for _ in range(calls):
                     result = candidate(index)
                 seconds[name].append((clock() - begun) / calls)
+                cpu_seconds[name].append((cpu_clock() - cpu_begun) / calls)
                 results[name].append(result)
     finally:
         gc.enable()
     return {
-        name: Times(np.asarray(seconds[name]), results[name], single=calls == 1)
+        name: Times(
+            np.asarray(seconds[name]), results[name], calls == 1, np.asarray(cpu_seconds[name])
+        )
         for name in candidates
     }

@@ -1,7 +1,7 @@
 """Sparse quadratic programs: PIQP, and Clarabel where PIQP gives up.
 
 Both solve min z'Pz/2 + c'z subject to Az = b and low <= z <= high. Which solver stands first was
-measured; see `benchmarks/speed/planner.py`.
+measured; see `benchmarks/speed/programs.py`.
 """
 
 from __future__ import annotations
