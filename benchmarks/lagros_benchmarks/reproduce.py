@@ -11,6 +11,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -81,6 +82,7 @@ def reproduce_cartpole(
     task = CartPoleSettings()
     _claim(folder, settings)
     metric = _metric(folder, settings, task, update, note)
+    begun = perf_counter()
     data = generate(
         folder / "data",
         metric,
@@ -90,7 +92,8 @@ def reproduce_cartpole(
         lambda done: update("expert data", done, settings.data.shards),
     )
     note(
-        f"expert data: {len(data.observation)} samples around {len(data.plan_states)} plans; "
+        f"expert data ({perf_counter() - begun:.0f} s): {len(data.observation)} samples around "
+        f"{len(data.plan_states)} plans; "
         f"{data.drawn - len(data.observation)} states outside the verified region were rejected"
     )
     # (c) imitates u* in the tube, (a) imitates u_d on the plans.
@@ -123,6 +126,7 @@ def _metric(
     note: Callable[[str], None],
 ) -> Metric:
     path = folder / "metric.json"
+    begun = perf_counter()
     update("metric", 0, 1)
     if not path.exists():
         save_metric(design_cartpole_metric(settings.metric, task), path)
@@ -131,8 +135,8 @@ def _metric(
     check = metric.verification
     if check is not None:
         note(
-            f"metric: alpha = {metric.contraction_rate:g} 1/s, chi = {metric.condition_bound:.4g}, "
-            f"nu = {metric.control_weight:.4g}; the condition fails on {check.violations} of "
+            f"metric ({perf_counter() - begun:.0f} s): alpha = {metric.contraction_rate:g} 1/s, "
+            f"chi = {metric.condition_bound:.4g}, nu = {metric.control_weight:.4g}; the condition fails on {check.violations} of "
             f"{check.samples} fresh states"
         )
     return metric
@@ -153,6 +157,7 @@ def _network(
     features, side = cartpole_features(observation.astype(np.float32))
     labels: Float32Array = (control * side[:, None]).astype(np.float32)
     held_out = _held_out(plan, training.held_out)
+    begun = perf_counter()
     if not weights.exists():
         network = fit(
             features[~held_out],
@@ -173,8 +178,8 @@ def _network(
     }
     write_atomic(weights.with_suffix(".json"), json.dumps(record, indent=1) + "\n")
     note(
-        f"{name}: learning error on {error.samples} held-out samples: mean {error.mean:.3g} N, "
-        f"p99 {error.p99:.3g} N, max {error.maximum:.3g} N"
+        f"{name} ({perf_counter() - begun:.0f} s): learning error on {error.samples} held-out "
+        f"samples: mean {error.mean:.3g} N, p99 {error.p99:.3g} N, max {error.maximum:.3g} N"
     )
 
 
