@@ -136,8 +136,8 @@ def _metric(
     if check is not None:
         note(
             f"metric ({perf_counter() - begun:.0f} s): alpha = {metric.contraction_rate:g} 1/s, "
-            f"chi = {metric.condition_bound:.4g}, nu = {metric.control_weight:.4g}; the condition fails on {check.violations} of "
-            f"{check.samples} fresh states"
+            f"chi = {metric.condition_bound:.4g}, nu = {metric.control_weight:.4g}; "
+            f"the condition fails on {check.violations} of {check.samples} fresh states"
         )
     return metric
 
