@@ -105,9 +105,8 @@ def test_radii_of_the_released_preset_are_planned_for():
     _, memory = policy.predict(env.state())
     plan = memory[0].plan
     assert plan.solved
-    apart = np.linalg.norm(
-        plan.resample(0.1)[0][0, :, :2] - plan.resample(0.1)[0][1, :, :2], axis=1
-    )
+    places = plan.resample(0.1)[0][..., :2]
+    apart = np.linalg.norm(places[0] - places[1], axis=-1)
     assert apart.min() >= 1.0
     assert plan.clearance >= 0.0
 
@@ -259,6 +258,9 @@ def test_the_margin_follows_the_bound_and_the_rate():
     )
     assert asked(disturbance_bound=0.0) == pytest.approx(0.05)
     assert asked(disturbance_bound=0.8, margin=0.1) == pytest.approx(0.1)
+    planner = CentralizedPolicy(disturbance_bound=0.8).planner.settings
+    assert planner.pair_share == pytest.approx(np.sqrt(2.0))
+    assert list(planner.margins) == sorted(planner.margins, reverse=True)
     own = SpacecraftPlannerSettings(margins=(0.2,))
     assert CentralizedPolicy(planner=own).planner.settings is own
 
@@ -268,7 +270,8 @@ def test_the_margin_follows_the_bound_and_the_rate():
     [
         ({"disturbance_bound": -0.1}, "disturbance_bound=-0.1"),
         ({"disturbance_bound": float("nan")}, "disturbance_bound=nan"),
-        ({"contraction_rate": 0.0}, "rate"),
+        ({"contraction_rate": 0.0}, "contraction_rate=0.0"),
+        ({"turning_rate": -1.0}, "turning_rate=-1.0"),
         ({"margin": -1.0}, "margin=-1.0"),
         ({"margin": 0.1, "planner": SpacecraftPlannerSettings()}, "not both"),
         ({"planner": SpacecraftPlannerSettings(mass=2.0)}, "mass=2.0"),
@@ -298,8 +301,8 @@ def test_observations_of_something_else_get_a_clear_error():
         policy.predict(env.state()[None, None])
 
 
-def test_a_state_has_the_same_length_for_other_agents_only_with_other_obstacles():
-    # 4 agents and 3 obstacles fill as many numbers as 3 agents and 5.
+def test_a_state_of_the_right_length_for_other_agents_is_refused():
+    # Four agents and three obstacles fill as many numbers as three agents and five.
     preset = dataclasses.replace(PRESETS["paper"], obstacle_count=(3, 3))
     env = spacecraft_v0.parallel_env(4, preset)
     env.reset(seed=0)
