@@ -7,17 +7,19 @@ import importlib
 from collections.abc import Callable
 from typing import Any, Literal, Protocol, cast, runtime_checkable
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.spacecraft_task import SpacecraftSettings
 
 Float32Array = NDArray[np.float32]
 # What a planner remembers between calls; stateless policies keep None.
 PolicyState = Any
 
+# Policies of the cart-pole, and of the spacecraft.
 NAMES = ("learned", "tube-mpc", "lagros", "lqr", "random", "ppo")
+SPACECRAFT_NAMES = ("centralized",)
 
 
 @runtime_checkable
@@ -47,15 +49,16 @@ class Policy(Protocol):
         """
 
 
-def make(name: str, env: gym.Env[Any, Any], **settings: Any) -> Policy:
+def make(name: str, env: Any, **settings: Any) -> Policy:
     """Build a policy for an environment.
 
     Args:
-        name: One of `NAMES`; the path of a stable-baselines3 model (`ppo.zip`, `sac:model.zip`);
-            or `module:Class`, a class of your own that is built with the task's settings. A zip of
-            stable-baselines3 holds pickled code and a module is code: both run, so name only what
-            you trust.
-        env: The environment; the policy takes its task settings and nothing else.
+        name: One of `NAMES` (`SPACECRAFT_NAMES` for the spacecraft); the path of a
+            stable-baselines3 model (`ppo.zip`, `sac:model.zip`); or `module:Class`, a class of your
+            own that is built with the task's settings. A zip of stable-baselines3 holds pickled
+            code and a module is code: both run, so name only what you trust.
+        env: A Gymnasium or PettingZoo environment of this package; the policy takes its task
+            settings (and preset) and nothing else.
         settings: Passed to the policy, e.g. `weights=path` or `metric=...`.
 
     Returns:
@@ -66,9 +69,14 @@ def make(name: str, env: gym.Env[Any, Any], **settings: Any) -> Policy:
         TypeError: The environment is not one of this package.
     """
     task = getattr(env.unwrapped, "settings", None)
-    if not isinstance(task, CartPoleSettings):
+    if isinstance(task, SpacecraftSettings):
+        names: tuple[str, ...] = SPACECRAFT_NAMES
+        settings = {"preset": env.unwrapped.preset, **settings}
+    elif isinstance(task, CartPoleSettings):
+        names = NAMES
+    else:
         raise TypeError(f"there are no policies for {env}; use an environment of lagros_envs")
-    if name in NAMES:
+    if name in names:
         return _builders()[name](task, **settings)
     if name.endswith(".zip"):
         from lagros_policies.baselines import load_stable_baselines3
@@ -77,10 +85,10 @@ def make(name: str, env: gym.Env[Any, Any], **settings: Any) -> Policy:
         return load_stable_baselines3(path, algorithm or None, **settings)
     if ":" in name:
         return _own_policy(name)(task, **settings)
-    near = difflib.get_close_matches(name, NAMES, n=1)
+    near = difflib.get_close_matches(name, names, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     raise ValueError(
-        f"policy {name!r} is not known.{hint} Use one of {', '.join(NAMES)}, the path of a "
+        f"policy {name!r} is not known.{hint} Use one of {', '.join(names)}, the path of a "
         "stable-baselines3 zip, or module:Class"
     )
 
@@ -99,6 +107,7 @@ def _own_policy(name: str) -> Callable[..., Policy]:
 def _builders() -> dict[str, Callable[..., Policy]]:
     # Imported late: torch, solvers and learned weights are needed only by whoever asks for them.
     from lagros_policies.baselines import LqrPolicy, PpoPolicy, RandomPolicy
+    from lagros_policies.centralized import CentralizedPolicy
     from lagros_policies.lagros import LagrosPolicy
     from lagros_policies.learned import LearnedPolicy
     from lagros_policies.tube_mpc import TubeMpcPolicy
@@ -110,4 +119,5 @@ def _builders() -> dict[str, Callable[..., Policy]]:
         "lqr": LqrPolicy,
         "random": RandomPolicy,
         "ppo": PpoPolicy,
+        "centralized": CentralizedPolicy,
     }

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+import lagros_policies
 from lagros_envs import spacecraft_v0
 from lagros_envs.scenarios import PRESETS, Scenario
 from lagros_envs.spacecraft_task import SpacecraftSettings
@@ -323,3 +324,15 @@ def test_memories_of_something_else_get_a_clear_error():
     env.reset(seed=1)
     with pytest.raises(ValueError, match="other goals"):
         policy.predict(env.state(), memory)
+
+
+def test_make_builds_it_for_the_spacecraft_and_names_what_there_is():
+    env = spacecraft_v0.parallel_env(num_agents=2, preset="open")
+    policy = lagros_policies.make("centralized", env, disturbance_bound=0.2)
+    assert policy.observes == "global"
+    assert policy.agents == 2
+    env.reset(seed=0)
+    action, _ = policy.predict(env.state())
+    assert action.shape == (2, 8)
+    with pytest.raises(ValueError, match="centralized"):
+        lagros_policies.make("lagros", env)
