@@ -21,7 +21,9 @@ class CartPolePlannerSettings:
     """The tube by which the admissible angles shrink (Theorem 3), and how to iterate.
 
     The whole-state tube of the paper (3.15 at the end) is wider than the admissible set, so the
-    tightening uses the angle's own margin, an observed one: it is not a proved bound.
+    tightening uses a margin of the angle alone. It is observed, not proved: under uniform
+    disturbance of 0.75 the angle of (b) strayed by at most 0.26 rad in 1,000 episodes, though in the
+    first second by more than the margin has grown to.
 
     Attributes:
         angle_margin: Steady margin of the angle [rad].
