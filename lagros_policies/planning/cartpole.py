@@ -22,8 +22,8 @@ class CartPolePlannerSettings:
 
     The whole-state tube of the paper (3.15 at the end) is wider than the admissible set, so the
     tightening uses a margin of the angle alone. It is observed, not proved: under uniform
-    disturbance of 0.75 the angle of (b) strayed by at most 0.26 rad in 1,000 episodes, though in the
-    first second by more than the margin has grown to.
+    disturbance of 0.75 the angle of (b) strayed by at most 0.26 rad in 1,000 episodes, though in
+    the first second by more than the margin has grown to.
 
     Attributes:
         angle_margin: Steady margin of the angle [rad].
