@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lagros_envs.cartpole_task import FALL_ANGLE, CartPoleSettings
 from lagros_envs.dynamics.cartpole import ANGLE
+from lagros_policies.contraction.tube import tighten
 from lagros_policies.planning.scp import ScpSettings, ScpSolver
 from lagros_policies.planning.trajectory import Trajectory
 
@@ -66,8 +67,9 @@ class CartPolePlanner:
 
     def angle_limit(self, time: FloatArray) -> FloatArray:
         """Return the tightened bound of |theta_d| [rad] at the times [s] (Theorem 3)."""
-        settings = self.settings
-        return FALL_ANGLE - settings.angle_margin * -np.expm1(-settings.margin_rate * time)
+        margin = self.settings.angle_margin * -np.expm1(-self.settings.margin_rate * time)
+        whole = np.full_like(margin, FALL_ANGLE)
+        return tighten(-whole, whole, margin)[1]
 
     def plan(
         self,
