@@ -166,3 +166,25 @@ def test_the_time_of_a_slow_step_is_measured_and_its_deadline_missed(env, monkey
     record = run_episode(env, LinearPolicy(), 3, None)
     assert record.step_times[:3].tolist() == [0.01, 1.0, 0.0]
     assert record.deadline_misses == 1
+
+
+def test_an_exception_after_a_success_is_a_failure_all_the_same(env):
+    nominal = nominal_of(env, 3)
+    success_time = run_episode(env, LinearPolicy(), 3, nominal).success_time
+    assert success_time is not None
+
+    class RaisesAfterwards(LinearPolicy):
+        calls = 0
+
+        def predict(self, *arguments):
+            self.calls += 1
+            if self.calls > round(10 * success_time) + 2:
+                raise RuntimeError("too late")
+            return super().predict(*arguments)
+
+    record = run_episode(env, RaisesAfterwards(), 3, nominal)
+    assert record.error == "RuntimeError: too late"
+    assert not record.success
+    assert record.success_time is None
+    assert not record.strict_success
+    assert record.left_paper_tube
