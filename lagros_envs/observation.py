@@ -10,7 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lagros_envs.spacecraft_task import STATE_DIM
+from lagros_envs.scenarios import Preset
+from lagros_envs.spacecraft_task import STATE_DIM, SpacecraftSettings
 from lagros_envs.spacecraft_world import SpacecraftWorld
 
 FloatArray = NDArray[np.float64]
@@ -45,6 +46,11 @@ class Layout:
     def of(cls, world: SpacecraftWorld) -> Layout:
         """Return the layout for a world; there is always one slot of each kind."""
         return cls(max(1, world.agents - 1), max(1, world.obstacles), world.settings.time_limit)
+
+    @classmethod
+    def for_preset(cls, preset: Preset, settings: SpacecraftSettings) -> Layout:
+        """Return the layout for the worlds of a preset, whose `agents` is their number."""
+        return cls(max(1, preset.agents - 1), max(1, preset.obstacle_count[1]), settings.time_limit)
 
     @property
     def shapes(self) -> OrderedDict[str, tuple[int, ...]]:

@@ -38,7 +38,8 @@ BORDER = 0.6  # kept around the scenario [m]
 YELLOW: Colour = (240, 228, 66)
 COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY_BLUE, YELLOW)
 BODY = 0.62  # half the side of the body, as a share of the agent's radius
-PLUME = 1.1  # length of a plume at the thrust scale, as a share of the agent's radius
+PLUME = 1.7  # length of a plume at the thrust scale, as a share of the agent's radius
+TUBE_PERIOD = 0.5  # from disc to disc of a planned tube [s]
 # For each thruster, in the body's axes and in units of half the body: where it sits, and where its
 # plume points. The plume leaves against the force.
 THRUSTERS = (
@@ -105,11 +106,14 @@ class SpacecraftRenderer:
         self._fit(world)
         self._canvas.fill(WHITE)
         self._draw_arena()
+        self._draw_sensing(world)
+        self._draw_planned_tubes(world)
         self._draw_obstacles(world)
         self._draw_goals(world)
         self._draw_trails()
         for agent in range(world.agents):
             self._draw_agent(world, agent)
+        self._draw_nominal(world)
         self._draw_panel(world, time)
         frame = pygame.transform.smoothscale(self._canvas, (VIEW + PANEL, VIEW))
         if self._window is None:
@@ -167,21 +171,53 @@ class SpacecraftRenderer:
             if math.isfinite(radius):
                 self._disc(centre, radius, mix(GREY, 0.75))
 
+    def _draw_sensing(self, world: SpacecraftWorld) -> None:
+        for agent, place in enumerate(world.parts[:2, 0].T):
+            self._dashed_ring(place, world.settings.sensing_radius, mix(self._colour(agent), 0.4))
+
+    def _draw_planned_tubes(self, world: SpacecraftWorld) -> None:
+        """Draw what is left of the plans x_d, as wide as the published tube."""
+        if world.nominal is None:
+            return
+        settings = world.settings
+        stride = max(1, round(TUBE_PERIOD / settings.control_period))
+        steps = np.arange(int(world.step_count[0]), settings.steps + 1, stride)
+        radii = settings.tube.radius(steps * settings.control_period)
+        paths = world.nominal[0, steps, :, :2]
+        for agent in range(world.agents):
+            # A place where the plan waits is drawn once.
+            moves = np.linalg.norm(np.diff(paths[:, agent], axis=0), axis=1) > 1e-3
+            kept = np.append(moves, True)
+            for place, radius in zip(paths[kept, agent], radii[kept], strict=True):
+                self._disc(place, float(radius), mix(self._colour(agent), 0.2))
+        for agent in range(world.agents):
+            points = [self._point(place) for place in paths[:, agent]]
+            if len(points) > 1:
+                colour = mix(self._colour(agent), 0.45)
+                self._pygame.draw.lines(self._canvas, colour, False, points, OVERSAMPLING)
+
     def _draw_goals(self, world: SpacecraftWorld) -> None:
         settings = world.settings
         arrived = np.isfinite(world.success_time[0])
         tube = float(settings.tube.radius(float(world.time[0])))
-        nominal = world.nominal_now()
         for agent, goal in enumerate(world.goals[:, 0].T):
             colour = self._colour(agent)
             self._disc(goal, settings.goal_radius, mix(colour, 0.6 if arrived[agent] else 0.25))
             self._ring(goal, settings.goal_radius, colour, 1.5)
             self._ring(goal, tube, mix(BLACK, 0.6), 1.0)
             self._cross(goal, 0.35 * settings.goal_radius, colour, 2.0)
-            if nominal is not None:
-                place = nominal[0, agent, :2]
-                self._disc(place, 0.25 * world.agent_radius[0], mix(colour, 0.5))
-                self._ring(place, tube, colour, 1.0)
+            label = goal + np.array([-1.0, 1.0]) * settings.goal_radius
+            self._text(str(agent), self._point(label), mix(BLACK, 0.6), 15, anchor="center")
+
+    def _draw_nominal(self, world: SpacecraftWorld) -> None:
+        """Draw where the plans are now, and the tube around them, over the agents."""
+        nominal = world.nominal_now()
+        if nominal is None:
+            return
+        tube = float(world.settings.tube.radius(float(world.time[0])))
+        for place in nominal[0, :, :2]:
+            self._disc(place, 0.14 * float(world.agent_radius[0]), BLACK)
+            self._ring(place, tube, BLACK, 1.0)
 
     def _draw_trails(self) -> None:
         if len(self._trail) < 2:
@@ -199,9 +235,10 @@ class SpacecraftRenderer:
         radius = float(world.agent_radius[0])
         first = np.array([math.cos(heading), -math.sin(heading)])
         second = np.array([math.sin(heading), math.cos(heading)])
-        self._dashed_ring(centre, world.settings.sensing_radius, mix(colour, 0.4))
         self._disc(centre, radius, mix(colour, 0.25))
-        self._ring(centre, radius, mix(colour, 0.7), 1.0)
+        # An agent hides the goal it sits on, so that its own rim says that it has arrived.
+        arrived = bool(np.isfinite(world.success_time[0, agent]))
+        self._ring(centre, radius, BLACK if arrived else mix(colour, 0.7), 2.0 if arrived else 1.0)
         half = BODY * radius
         self._draw_plumes(world, agent, centre, half * first, half * second)
         corners = [centre + half * (a * first + b * second) for a, b in _SQUARE]
@@ -253,7 +290,8 @@ class SpacecraftRenderer:
             colour = VERMILLION if index == 2 and collided else BLACK
             self._text(row, place, colour, 20, anchor="midleft")
         keys = [
-            ("disc", mix(BLUE, 0.25), "goal; darker: arrived"),
+            ("disc", mix(BLUE, 0.25), "goal"),
+            ("rim", mix(BLUE, 0.25), "arrived"),
             ("ring", mix(BLACK, 0.6), "tube r(t)"),
             ("dashed", mix(BLUE, 0.4), "sensing radius"),
             ("plume", VERMILLION, "thruster firing"),
@@ -261,7 +299,7 @@ class SpacecraftRenderer:
             ("disc", mix(GREY, 0.75), "obstacle"),
         ]
         if world.nominal is not None:
-            keys.append(("disc", mix(BLUE, 0.5), "nominal x_d"))
+            keys.append(("tube", mix(BLUE, 0.2), "plan x_d in its tube"))
         for index, (shape, colour, label) in enumerate(keys):
             level = (200 + 26 * index) * OVERSAMPLING
             self._draw_key(shape, colour, label, left + 28 * OVERSAMPLING, level)
@@ -276,6 +314,11 @@ class SpacecraftRenderer:
         centre = (across, level)
         if shape == "disc":
             pygame.draw.circle(self._canvas, colour, centre, 9 * unit)
+        elif shape in ("rim", "tube"):
+            pygame.draw.circle(self._canvas, colour, centre, 9 * unit)
+            pygame.draw.circle(self._canvas, BLACK, centre, 9 * unit, 4 if shape == "rim" else 2)
+            if shape == "tube":
+                pygame.draw.circle(self._canvas, BLACK, centre, 3 * unit)
         elif shape == "ring":
             pygame.draw.circle(self._canvas, colour, centre, 9 * unit, 2)
         elif shape == "dashed":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lagros_policies.imitation.network_policy import NetworkPolicy
+from lagros_policies.imitation.spacecraft_policy import SpacecraftNetworkPolicy
 
 
 class LagrosPolicy(NetworkPolicy):
@@ -10,3 +11,10 @@ class LagrosPolicy(NetworkPolicy):
 
     name = "lagros"
     weights_file = "cartpole_lagros.safetensors"
+
+
+class SpacecraftLagrosPolicy(SpacecraftNetworkPolicy):
+    """o_l -> u* of each spacecraft from what it senses alone."""
+
+    name = "lagros"
+    weights_file = "spacecraft_lagros.safetensors"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lagros_policies.imitation.network_policy import NetworkPolicy
+from lagros_policies.imitation.spacecraft_policy import SpacecraftNetworkPolicy
 
 
 class LearnedPolicy(NetworkPolicy):
@@ -10,3 +11,10 @@ class LearnedPolicy(NetworkPolicy):
 
     name = "learned"
     weights_file = "cartpole_learned.safetensors"
+
+
+class SpacecraftLearnedPolicy(SpacecraftNetworkPolicy):
+    """o_l -> u_d of each spacecraft, learned on undisturbed plans."""
+
+    name = "learned"
+    weights_file = "spacecraft_learned.safetensors"

@@ -19,7 +19,7 @@ PolicyState = Any
 
 # Policies of the cart-pole, and of the spacecraft.
 NAMES = ("learned", "tube-mpc", "lagros", "lqr", "random", "ppo")
-SPACECRAFT_NAMES = ("centralized",)
+SPACECRAFT_NAMES = ("learned", "tube-mpc", "lagros", "centralized")
 
 
 @runtime_checkable
@@ -71,13 +71,14 @@ def make(name: str, env: Any, **settings: Any) -> Policy:
     task = getattr(env.unwrapped, "settings", None)
     if isinstance(task, SpacecraftSettings):
         names: tuple[str, ...] = SPACECRAFT_NAMES
+        builders = _spacecraft_builders
         settings = {"preset": env.unwrapped.preset, **settings}
     elif isinstance(task, CartPoleSettings):
-        names = NAMES
+        names, builders = NAMES, _cartpole_builders
     else:
         raise TypeError(f"there are no policies for {env}; use an environment of lagros_envs")
     if name in names:
-        return _builders()[name](task, **settings)
+        return builders()[name](task, **settings)
     if name.endswith(".zip"):
         from lagros_policies.baselines import load_stable_baselines3
 
@@ -104,10 +105,9 @@ def _own_policy(name: str) -> Callable[..., Policy]:
         ) from error
 
 
-def _builders() -> dict[str, Callable[..., Policy]]:
+def _cartpole_builders() -> dict[str, Callable[..., Policy]]:
     # Imported late: torch, solvers and learned weights are needed only by whoever asks for them.
     from lagros_policies.baselines import LqrPolicy, PpoPolicy, RandomPolicy
-    from lagros_policies.centralized import CentralizedPolicy
     from lagros_policies.lagros import LagrosPolicy
     from lagros_policies.learned import LearnedPolicy
     from lagros_policies.tube_mpc import TubeMpcPolicy
@@ -119,5 +119,18 @@ def _builders() -> dict[str, Callable[..., Policy]]:
         "lqr": LqrPolicy,
         "random": RandomPolicy,
         "ppo": PpoPolicy,
+    }
+
+
+def _spacecraft_builders() -> dict[str, Callable[..., Policy]]:
+    from lagros_policies.centralized import CentralizedPolicy
+    from lagros_policies.distributed import DistributedTubeMpcPolicy
+    from lagros_policies.lagros import SpacecraftLagrosPolicy
+    from lagros_policies.learned import SpacecraftLearnedPolicy
+
+    return {
+        "learned": SpacecraftLearnedPolicy,
+        "tube-mpc": DistributedTubeMpcPolicy,
+        "lagros": SpacecraftLagrosPolicy,
         "centralized": CentralizedPolicy,
     }

@@ -12,6 +12,8 @@ force and torque do not compete, the heading does not matter, and zero torque co
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,22 +36,26 @@ def allocate(body: Spacecraft, wrench: FloatArray) -> FloatArray:
     Returns:
         u, shape (..., 8) [N]; `body.wrench` of it is the wrench.
     """
-    half = 0.5 * wrench[..., :2]
-    lever = wrench[..., 2] / (2.0 * (body.arm**2 + body.side_arm**2))
-    turn_first, turn_second = body.arm * lever, body.side_arm * lever
-    signed = np.stack(
+    return np.maximum(wrench @ allocation_matrix(body), 0.0)
+
+
+@lru_cache(maxsize=16)
+def allocation_matrix(body: Spacecraft) -> FloatArray:
+    """Return the matrix (3, 8) of the signed thrusters s = G'(G G')^-1 w, each with both signs."""
+    share = 2.0 * (body.arm**2 + body.side_arm**2)
+    turn, side_turn = body.arm / share, body.side_arm / share
+    signed = np.array(
         [
-            half[..., 0] + turn_first,
-            half[..., 0] - turn_first,
-            half[..., 1] + turn_second,
-            half[..., 1] - turn_second,
-        ],
-        axis=-1,
+            [0.5, 0.5, 0.0, 0.0],
+            [0.0, 0.0, 0.5, 0.5],
+            [turn, -turn, side_turn, -side_turn],
+        ]
     )
-    thrust = np.empty((*signed.shape[:-1], 8))
-    thrust[..., _POSITIVE] = np.maximum(signed, 0.0)
-    thrust[..., _NEGATIVE] = np.maximum(-signed, 0.0)
-    return thrust
+    matrix = np.zeros((3, 8))
+    matrix[:, _POSITIVE] = signed
+    matrix[:, _NEGATIVE] = -signed
+    matrix.flags.writeable = False
+    return matrix
 
 
 def least_effort(body: Spacecraft, wrench: FloatArray) -> FloatArray:

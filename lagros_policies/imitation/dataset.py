@@ -1,18 +1,14 @@
 """Algorithm 1: random episodes, target trajectories, states in their tubes, labels u*.
 
-The work is cut into shards that depend on nothing but the settings and their index. A shard is
-written under a temporary name and renamed, so that whatever interrupts the work, every finished
-shard survives and the rest is made again, bit for bit.
+The work is cut into shards that depend on nothing but the settings and their index; see `shards`.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
-import json
-import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +18,10 @@ from numpy.typing import NDArray
 from lagros_envs import cartpole_task as task
 from lagros_envs.disturbances import OPEN_LOOP, into_unit_ball
 from lagros_envs.dynamics import hold_step
-from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_policies.contraction import Metric
 from lagros_policies.expert import CartPoleExpert, TrackedPlans
+from lagros_policies.imitation.shards import Shard, make_shards
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -135,31 +131,15 @@ def generate(
     Raises:
         ValueError: The folder holds data of other settings, or a shard is damaged.
     """
-    import joblib
-
     task_settings = task_settings or task.CartPoleSettings()
-    folder.mkdir(parents=True, exist_ok=True)
-    _claim(folder, metric, settings, task_settings)
-    paths = [folder / f"shard_{index:04d}.npz" for index in range(settings.shards)]
-    missing = [index for index, path in enumerate(paths) if not path.exists()]
-    done = settings.shards - len(missing)
-    if on_shard is not None:
-        on_shard(done)
-    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
-    calls = (
-        joblib.delayed(_write_shard)(paths[index], index, metric, settings, task_settings)
-        for index in missing
-    )
-    for _ in parallel(calls):
-        done += 1
-        if on_shard is not None:
-            on_shard(done)
-    return _gather(paths)
+    make = partial(make_shard, metric=metric, settings=settings, task_settings=task_settings)
+    record = _record(metric, settings, task_settings)
+    return _join(make_shards(folder, settings.shards, make, record, jobs, on_shard))
 
 
 def make_shard(
     index: int, metric: Metric, settings: ExpertDataSettings, task_settings: task.CartPoleSettings
-) -> dict[str, Any]:
+) -> Shard:
     """Generate one shard: plan, fill the tubes, keep the verified region, label."""
     expert = CartPoleExpert(metric, task_settings)
     count = settings.plans // settings.shards
@@ -259,29 +239,7 @@ def tube_states(
     return met[finite], plan_of, step_of
 
 
-def _write_shard(
-    path: Path,
-    index: int,
-    metric: Metric,
-    settings: ExpertDataSettings,
-    task_settings: task.CartPoleSettings,
-) -> None:
-    shard = make_shard(index, metric, settings, task_settings)
-    buffer = io.BytesIO()
-    np.savez(buffer, **shard)
-    write_atomic(path, buffer.getvalue())
-
-
-def _gather(paths: list[Path]) -> ExpertData:
-    shards = []
-    for path in paths:
-        try:
-            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-                shards.append({name: file[name] for name in file.files})
-        except (zipfile.BadZipFile, EOFError, ValueError) as error:
-            raise ValueError(
-                f"{path} is damaged ({error}); remove it, and it is made again"
-            ) from error
+def _join(shards: list[Shard]) -> ExpertData:
     offset = 0
     for shard in shards:
         shard["plan"] = shard["plan"] + offset
@@ -293,27 +251,14 @@ def _gather(paths: list[Path]) -> ExpertData:
     return ExpertData(**joined, drawn=int(sum(int(shard["drawn"]) for shard in shards)))
 
 
-def _claim(
-    folder: Path,
-    metric: Metric,
-    settings: ExpertDataSettings,
-    task_settings: task.CartPoleSettings,
-) -> None:
-    """Refuse to mix shards of different settings in one folder."""
+def _record(
+    metric: Metric, settings: ExpertDataSettings, task_settings: task.CartPoleSettings
+) -> dict[str, Any]:
+    """Return all that the data depend on."""
     law = {
         "coefficients": hashlib.sha256(metric.coefficients.tobytes()).hexdigest(),
         "alpha": metric.contraction_rate,
         "region": asdict(metric.region),
         "feedback": asdict(CartPoleExpert(metric, task_settings).feedback),
     }
-    record = json.loads(
-        json.dumps({"data": asdict(settings), "task": asdict(task_settings), "metric": law})
-    )
-    manifest = folder / "manifest.json"
-    if manifest.exists():
-        if json.loads(manifest.read_text()) != record:
-            raise ValueError(
-                f"{folder} holds expert data of other settings; name another folder or remove it"
-            )
-        return
-    write_atomic(manifest, json.dumps(record, indent=1) + "\n")
+    return {"data": asdict(settings), "task": asdict(task_settings), "metric": law}

@@ -77,6 +77,10 @@ class JointProblem:
         substeps: Control steps in a node step.
         mass: m [kg].
         speed_limit: v_max per agent and axis, shape (n, 2) [m/s].
+        arrivals: Node at which each agent is at its goal, and from which on it stays there without
+            force, shape (n,); the last node if left out.
+        start_cost: If given, a plan may begin beside `starts`: each axis' deviation e = (position,
+            velocity) costs e'Qe / 2 with this positive definite Q, shape (2, 2).
     """
 
     starts: FloatArray
@@ -88,6 +92,8 @@ class JointProblem:
     substeps: int
     mass: float
     speed_limit: FloatArray
+    arrivals: IntArray | None = None
+    start_cost: FloatArray | None = None
 
     @property
     def nodes(self) -> int:
@@ -232,9 +238,8 @@ class _Layout:
         agent = np.arange(n)[None, :, None] * 6
         self.forces = (block + agent + np.arange(2))[:nodes]  # (N, n, 2)
         self.states = block + agent + 2 + np.arange(4)  # (N + 1, n, 4)
-        # The last node has no force: its two places per agent are pinned to zero.
+        # From the arrival on, the last node included, there is no force: pinned to zero.
         self.size = (nodes + 1) * 6 * n
-        self.idle = (block + agent + np.arange(2))[nodes].ravel()
         h = problem.node_period
         here, there = self.states[:-1], self.states[1:]
         place, speed = slice(0, 2), slice(2, 4)
@@ -250,16 +255,43 @@ class _Layout:
             (rows[..., speed], self.forces, -h / problem.mass * one),
         ]
         count = rows.size
-        for node, target in ((0, problem.starts), (nodes, problem.goals)):
-            ends = count + np.arange(target.size).reshape(target.shape)
-            entries.append((ends, self.states[node], np.ones(target.shape)))
-            count += target.size
+        goal_target = problem.goals
+        ends = count + np.arange(goal_target.size).reshape(goal_target.shape)
+        arrivals = np.full(n, nodes) if problem.arrivals is None else problem.arrivals
+        entries.append((ends, self.states[arrivals, np.arange(n)], np.ones(goal_target.shape)))
+        stays = np.arange(nodes + 1)[:, None] >= arrivals
+        self.idle = (block + agent + np.arange(2))[stays].ravel()
+        count += goal_target.size
+        start = count + np.arange(problem.starts.size).reshape(problem.starts.shape)
+        start_target = problem.starts
+        self.start_errors = np.empty(0, dtype=np.intp)
+        if problem.start_cost is None:
+            entries.append((start, self.states[0], np.ones(start_target.shape)))
+        else:
+            # Unknowns r = U e with Q = U'U make the cost of the deviation a diagonal one.
+            root = np.linalg.cholesky(problem.start_cost).T
+            self.start_errors = self.size + np.arange(start_target.size)
+            self.size += start_target.size
+            first = self.states[0]
+            entries += [
+                (start[:, place], first[:, place], np.full((n, 2), root[0, 0])),
+                (start[:, place], first[:, speed], np.full((n, 2), root[0, 1])),
+                (start[:, speed], first[:, speed], np.full((n, 2), root[1, 1])),
+                (start.ravel(), self.start_errors, np.full(start.size, -1.0)),
+            ]
+            start_target = np.hstack(
+                [
+                    root[0, 0] * problem.starts[:, :2] + root[0, 1] * problem.starts[:, 2:],
+                    root[1, 1] * problem.starts[:, 2:],
+                ]
+            )
+        count += start_target.size
         self.count = count
         self.rows, self.columns, self.values = (
             np.concatenate([part[index].ravel() for part in entries]) for index in range(3)
         )
         self.target = np.concatenate(
-            [np.zeros(rows.size), problem.starts.ravel(), problem.goals.ravel()]
+            [np.zeros(rows.size), goal_target.ravel(), start_target.ravel()]
         )
 
     def program(
@@ -284,6 +316,7 @@ class _Layout:
         size = self.size + 2 * count
         diagonal = np.zeros(size)
         diagonal[self.forces] = problem.node_period
+        diagonal[self.start_errors] = 1.0
         linear = np.zeros(size)
         linear[self.size : self.size + count] = settings.penalty
         low, high = np.full(size, -UNBOUNDED), np.full(size, UNBOUNDED)
@@ -335,8 +368,10 @@ def _half_planes(
     """
     last = places.shape[1] - 1
     reach = np.where(np.arange(last + 1) % problem.substeps == 0, settings.reach, settings.near)
-    # The ends are given: nothing can be imposed there.
-    reach[[0, last]] = -np.inf
+    # Where an end is given nothing can be imposed.
+    reach[last] = -np.inf
+    if problem.start_cost is None:
+        reach[0] = -np.inf
     first, second = problem.pairs
     # Obstacles: the second agent takes no part.
     delta = places[:, :, None, :] - problem.obstacles

@@ -33,6 +33,7 @@ from lagros_policies.planning.joint_scp import (
 )
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 
 # Distances are planned wider by this, so that a swept check finds the margins themselves kept [m].
 _SPARE = 5e-3
@@ -54,6 +55,8 @@ class SpacecraftPlannerSettings:
         pair_share: Room beyond touching between two agents, in margins.
         margin_growth: Where a start or goal lies inside a margin, the acceleration at which the
             margin grows from what there is, and shrinks towards the goal [m/s^2].
+        start_margin: Room beyond touching from the first instant of a plan that may begin beside
+            the states; the margin grows from there as above [m].
         speed_limit: Largest speed per axis; a node step at this speed must not cross an agent and
             its margins [m/s].
         candidates: Solved plans among which the one of least effort is taken.
@@ -75,6 +78,7 @@ class SpacecraftPlannerSettings:
     margins: tuple[float, ...] = (0.3, 0.15)
     pair_share: float = 1.0
     margin_growth: float = 0.02
+    start_margin: float = 0.12
     speed_limit: float = 0.7
     candidates: int = 1
     restarts: int = 2
@@ -89,7 +93,7 @@ class SpacecraftPlannerSettings:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name}={value!r} must be positive and finite")
-        for name in ("pair_share", "margin_growth"):
+        for name in ("pair_share", "margin_growth", "start_margin"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name}={value!r} must be finite and >= 0")
@@ -116,6 +120,8 @@ class _Scene:
     obstacles: FloatArray  # (m, 2)
     touching: FloatArray  # (m,) distance of the centres at touch
     pair_touching: float
+    arrivals: IntArray = field(default_factory=lambda: np.empty(0, np.intp))  # (n,) nodes
+    start_cost: FloatArray | None = None  # (2, 2), see JointProblem
 
 
 class SpacecraftPlanner:
@@ -137,7 +143,8 @@ class SpacecraftPlanner:
         obstacle_radius: FloatArray | float,
         agent_radius: float,
         core_radius: float | None = None,
-        duration: float | None = None,
+        duration: float | FloatArray | None = None,
+        start_cost: FloatArray | None = None,
     ) -> JointPlan:
         """Plan from the given states to rest at the goals.
 
@@ -148,8 +155,12 @@ class SpacecraftPlanner:
             obstacle_radius: One radius, or one per obstacle (m,) [m].
             agent_radius: Radius of every agent against the others [m].
             core_radius: Their radius against obstacles [m], may be 0; the same if left out.
-            duration: Time to the goals [s]; the horizon if left out. It is rounded down to whole
-                node steps, of which two must remain.
+            duration: Time to the goals [s], one for all or one per agent (n,); the horizon if left
+                out. It is rounded down to whole node steps, of which two must remain. Who arrives
+                before others stays at its goal.
+            start_cost: If given, plans begin in a tube around the states rather than there, where
+                they keep `start_margin`: the deviation (position, velocity) of each axis costs
+                e'Qe/2 with this Q, shape (2, 2).
 
         Returns:
             The plan. Where no guess led to a solved plan, the one that violates least, with
@@ -161,14 +172,9 @@ class SpacecraftPlanner:
         begun = time.perf_counter()
         settings = self.settings
         scene = _scene(starts, goals, obstacles, obstacle_radius, agent_radius, core_radius)
-        nodes = settings.nodes
-        if duration is not None:
-            nodes = math.floor(duration / settings.node_period + 1e-9)
-            if nodes < 2:
-                raise ValueError(
-                    f"duration={duration!r} s leaves fewer than two node steps of "
-                    f"{settings.node_period} s"
-                )
+        arrivals = self._arrivals(duration, len(scene.starts))
+        scene = replace(scene, arrivals=arrivals, start_cost=start_cost)
+        nodes = int(np.max(arrivals))
         solved: list[JointPlan] = []
         closest: tuple[float, JointPlan] | None = None
         iterations = attempts = 0
@@ -195,6 +201,20 @@ class SpacecraftPlanner:
         seconds = time.perf_counter() - begun
         return replace(chosen, iterations=iterations, attempts=attempts, seconds=seconds)
 
+    def _arrivals(self, duration: float | FloatArray | None, agents: int) -> IntArray:
+        """Return the node at which each agent arrives, shape (n,)."""
+        settings = self.settings
+        if duration is None:
+            return np.full(agents, settings.nodes)
+        times = np.broadcast_to(np.asarray(duration, dtype=np.float64), (agents,))
+        nodes = np.floor(times / settings.node_period + 1e-9)
+        if not np.all(nodes >= 2):
+            raise ValueError(
+                f"duration={duration!r} s leaves fewer than two node steps of "
+                f"{settings.node_period} s"
+            )
+        return nodes.astype(np.intp)
+
     def _problem(self, scene: _Scene, nodes: int, margin: float) -> JointProblem:
         settings = self.settings
         substeps = divisor("control_period", settings.control_period, settings.node_period)
@@ -211,6 +231,8 @@ class SpacecraftPlanner:
             substeps,
             settings.mass,
             np.maximum(settings.speed_limit, moving),
+            scene.arrivals,
+            scene.start_cost,
         )
 
     def _required(
@@ -224,12 +246,24 @@ class SpacecraftPlanner:
             gap = np.linalg.norm(place[:, None] - scene.obstacles, axis=-1)
             gaps.append(gap + spare - _SPARE)
             apart.append(np.linalg.norm(place[first] - place[second], axis=-1) + spare - _SPARE)
-        growth = 0.5 * self.settings.margin_growth
-        gone, left = growth * times**2, growth * (times[-1] - times) ** 2
+        settings = self.settings
+        growth = 0.5 * settings.margin_growth
+        arrive = settings.node_period * scene.arrivals
+        left = growth * np.maximum(arrive - times[:, None], 0.0) ** 2
+        left_pair = np.maximum(left[:, first], left[:, second])
+        gone = growth * times**2
         full = scene.touching + margin + spare
-        obstacle_required = np.minimum(gaps[0] + gone[:, None, None], gaps[1] + left[:, None, None])
-        full_pair = scene.pair_touching + self.settings.pair_share * margin + spare
-        pair_required = np.minimum(apart[0] + gone[:, None], apart[1] + left[:, None])
+        obstacle_required, pair_required = gaps[1] + left[:, :, None], apart[1] + left_pair
+        full_pair = scene.pair_touching + settings.pair_share * margin + spare
+        growing, pair_growing = gaps[0] + gone[:, None, None], apart[0] + gone[:, None]
+        if scene.start_cost is not None:
+            # A plan that may begin beside the states does not begin in touch.
+            least = min(margin, settings.start_margin)
+            growing = np.maximum(growing, scene.touching + least + spare)
+            least = scene.pair_touching + settings.pair_share * least + spare
+            pair_growing = np.maximum(pair_growing, least)
+        obstacle_required = np.minimum(growing, obstacle_required)
+        pair_required = np.minimum(pair_growing, pair_required)
         return np.minimum(obstacle_required, full), np.minimum(pair_required, full_pair)
 
     def _guesses(
@@ -240,18 +274,18 @@ class SpacecraftPlanner:
         begin, end = scene.starts[:, :2], scene.goals[:, :2]
         distance = scene.touching + margin
         times = instants(settings.control_period, problem.nodes * problem.substeps)
-        duration = float(times[-1])
+        due = settings.node_period * scene.arrivals
         paths = shortest_paths(begin, end, scene.obstacles, distance, grid)
         sidestep = grid.sidestep if len(begin) > 1 else 0.0
         way = np.array([np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1)) for path in paths])
         pair_distance = scene.pair_touching + settings.pair_share * margin
         for turn in range(max(settings.restarts + 1, settings.searches)):
             if turn <= settings.restarts:
-                depart, arrive = np.zeros(len(paths)), np.full(len(paths), duration)
+                depart, arrive = np.zeros(len(paths)), due
                 if turn > 0:
                     rng = np.random.default_rng([_RESTART_SEED, 0, turn])
-                    depart = rng.uniform(0.0, 0.4 * duration, len(paths))
-                    arrive = rng.uniform(0.6 * duration, duration, len(paths))
+                    depart = due * rng.uniform(0.0, 0.4, len(paths))
+                    arrive = due * rng.uniform(0.6, 1.0, len(paths))
                 name = "shortest paths" + (f", time shift {turn}" if turn > 0 else "")
                 walks = [
                     walk(path, smooth_progress(times, early, late), sidestep)

@@ -144,6 +144,33 @@ def test_the_nominal_is_drawn():
     assert columns.mean() == pytest.approx(column, abs=2)
 
 
+def test_what_is_left_of_a_plan_is_as_wide_as_the_tube():
+    """The band at the middle of the way, before the plan has passed there and after."""
+    nominal = np.zeros((451, 1, 6))
+    nominal[:, 0, 0] = np.linspace(1.0, 4.0, 451)
+    nominal[:, 0, 1] = 3.5
+    widths = []
+    for steps in (0, 300):
+        frame = drawn([[1.0, 1.0]], [[4.0, 1.0]], nominal=nominal, steps=steps)
+        row, column = place([2.5, 3.5])
+        strip = frame[row - 30 : row + 31, column].astype(int)
+        widths.append(np.sum(np.ptp(strip, axis=1) > 20))
+    # At 22.5 s the radius of the published tube is 0.125 m, to a part in a thousand.
+    assert widths[0] == pytest.approx(0.25 * VIEW / SIDE, abs=3)
+    assert widths[1] == 0
+
+
+def test_an_agent_that_has_arrived_has_a_dark_rim():
+    def dark(start, goal):
+        frame = drawn([start], [goal])
+        rows, columns = np.nonzero(np.all(frame[:, :VIEW] < 90, axis=-1))
+        row, column = place(start)
+        apart = np.hypot(rows - row, columns - column) * SIDE / VIEW
+        return np.sum(np.abs(apart - 0.25) < 0.03)
+
+    assert dark([2.0, 2.0], [2.1, 2.0]) > 5 * dark([2.0, 2.0], [4.0, 2.0])
+
+
 def test_the_view_widens_for_an_agent_that_leaves():
     frame = drawn([[1.0, 1.0]], [[9.0, 1.0]])
     assert pixels(frame, BLUE)[0].size > 30

@@ -1,0 +1,249 @@
+"""The spacecraft experiment from nothing: expert flights, networks (a) and (c), their benchmark.
+
+The networks of (c) are fitted in rounds: the first to flights of the expert, each later one also to
+what the one before it met when it flew, labelled by the expert (DAgger). Every stage leaves its
+files in the run's folder and is skipped where they are there. The same settings give the same
+files, bit for bit on one machine.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lagros_benchmarks.experiment import Progress
+from lagros_benchmarks.settings import BenchmarkSettings
+from lagros_envs.files import write_atomic
+from lagros_envs.scenarios import preset_named
+from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_policies.imitation.deep_set import DeepSet
+from lagros_policies.imitation.shards import claim
+from lagros_policies.imitation.spacecraft_flights import FlightData, FlightSettings, fly_expert
+from lagros_policies.imitation.train_deep_set import (
+    DeepSetTraining,
+    SetSamples,
+    fit_deep_set,
+    flight_samples,
+    join,
+)
+
+BOUNDS = (0.2, 0.4, 0.6, 0.8, 1.0)
+_RELABELLED = "relabelled"
+
+
+def _rounds() -> tuple[FlightSettings, ...]:
+    return tuple(FlightSettings(worlds=200, replan_period=2.0, seed=seed) for seed in (11, 12, 13))
+
+
+@dataclass(frozen=True)
+class SpacecraftReproduceSettings:
+    """All that the weights and the table depend on.
+
+    Attributes:
+        flights: Flights of the expert under disturbance.
+        calm: Its flights without, which (a) imitates.
+        rounds: Flights of one network after the other, labelled by the expert.
+        relabelled_weight: How often the samples of these flights count, others once.
+        held_out: Share of the worlds of the last round whose samples are never trained on.
+        intermediate: Training of the networks that fly.
+        lagros: Training of (c).
+        learned: Training of (a).
+        worlds: Paired worlds of the table at each bound.
+        bounds: d_bar of the table, uniform in the ball.
+        seed: Seed of the table.
+        jobs: Processes; they change no result.
+    """
+
+    flights: FlightSettings = field(default_factory=lambda: FlightSettings(worlds=600, seed=0))
+    calm: FlightSettings = field(
+        default_factory=lambda: FlightSettings(worlds=300, disturbance_bound=0.0, seed=1)
+    )
+    rounds: tuple[FlightSettings, ...] = field(default_factory=_rounds)
+    relabelled_weight: int = 3
+    held_out: float = 0.1
+    intermediate: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=4))
+    lagros: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=12))
+    learned: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=8))
+    worlds: int = 20
+    bounds: tuple[float, ...] = BOUNDS
+    seed: int = 0
+    jobs: int = 2
+
+    def benchmark(self, folder: Path | None) -> BenchmarkSettings:
+        """Return the benchmark of the four policies.
+
+        Args:
+            folder: Where the weights lie; None takes the shipped ones.
+        """
+        weights = {}
+        if folder is not None:
+            weights = {name: {"weights": str(_weights(folder, name))} for name in _NETWORKS}
+        return BenchmarkSettings.for_task(
+            "spacecraft",
+            episodes=self.worlds,
+            bounds=self.bounds,
+            seed=self.seed,
+            policy_settings=weights,
+            jobs=self.jobs,
+        )
+
+
+_NETWORKS = ("lagros", "learned")
+
+
+def reproduce_spacecraft(
+    folder: Path,
+    settings: SpacecraftReproduceSettings | None = None,
+    progress: Progress | None = None,
+    say: Callable[[str], None] | None = None,
+) -> BenchmarkSettings:
+    """Make expert flights and networks of the spacecraft.
+
+    Args:
+        folder: Where everything is kept.
+        settings: What to make.
+        progress: Called with a title, the units done and the units in all.
+        say: Called with a line after each stage.
+
+    Returns:
+        The benchmark of (a), (b), (c) and (d) with what was made, ready to run.
+
+    Raises:
+        ValueError: The folder holds a run of other settings.
+    """
+    settings = settings or SpacecraftReproduceSettings()
+    record = asdict(settings)
+    for free in ("jobs", "worlds", "seed", "bounds"):
+        del record[free]
+    folder.mkdir(parents=True, exist_ok=True)
+    claim(folder / "settings.json", record, "a run")
+    stage = _Stage(folder, settings, progress or (lambda *_: None), say or (lambda line: None))
+    calm = stage.fly("calm flights", settings.calm, None)
+    stage.fit("learned", settings.learned, [calm], calm)
+    parts = [stage.fly("flights", settings.flights, None)]
+    learner = stage.fit("round0", settings.intermediate, parts, parts[0])
+    for index, flights in enumerate(settings.rounds, start=1):
+        met = stage.fly(f"{_RELABELLED}{index}", flights, learner)
+        kept = _training_part(met, settings.held_out)
+        parts += [kept] * settings.relabelled_weight
+        last = index == len(settings.rounds)
+        name, training = (
+            ("lagros", settings.lagros) if last else (f"round{index}", settings.intermediate)
+        )
+        learner = stage.fit(name, training, parts, _held_out_part(met, settings.held_out))
+    return settings.benchmark(folder)
+
+
+@dataclass
+class _Stage:
+    """The stages of one run, each resumable."""
+
+    folder: Path
+    settings: SpacecraftReproduceSettings
+    progress: Progress
+    say: Callable[[str], None]
+    task: SpacecraftSettings = field(default_factory=SpacecraftSettings)
+
+    def fly(self, name: str, flights: FlightSettings, learner: Path | None) -> FlightData:
+        """Fly and label."""
+        begun = perf_counter()
+        data = fly_expert(
+            self.folder / name.replace(" ", "_"),
+            flights,
+            self.task,
+            learner,
+            self.settings.jobs,
+            lambda done: self.progress(name, done, flights.shards),
+        )
+        self.say(
+            f"{name} ({perf_counter() - begun:.0f} s): {len(data.observation)} samples in "
+            f"{flights.worlds} worlds, {data.failed_plans} of {data.plans} plans failed"
+        )
+        return data
+
+    def fit(
+        self, name: str, training: DeepSetTraining, parts: list[FlightData], test: FlightData
+    ) -> Path:
+        """Fit one network, unless its file is there, and write its record beside it."""
+        weights = _weights(self.folder, name)
+        begun = perf_counter()
+        record: dict[str, Any] = {}
+        if not weights.exists():
+            samples = join([self._samples(part) for part in parts])
+            network = fit_deep_set(
+                samples,
+                training,
+                self.folder / f"{name}_checkpoint.safetensors",
+                lambda epoch, _: self.progress(f"fit {name}", epoch, training.epochs),
+            )
+            network.metadata.update(policy=name, task="spacecraft")
+            network.save(weights)
+            record = {
+                "policy": name,
+                "command": "lagros reproduce spacecraft",
+                "training": asdict(training),
+                "samples": len(samples),
+                "weights": network.weights,
+            }
+        error = _learning_error(DeepSet.load(weights), self._samples(test))
+        if record:
+            record["learning_error"] = error
+            write_atomic(weights.with_suffix(".json"), json.dumps(record, indent=1) + "\n")
+        self.say(
+            f"{name} ({perf_counter() - begun:.0f} s): error of the acceleration, mean "
+            f"{error['mean']:.3g}, p99 {error['p99']:.3g} m/s² on {error['samples']} samples"
+        )
+        return weights
+
+    def _samples(self, data: FlightData) -> SetSamples:
+        preset = preset_named(self.settings.flights.preset)
+        core = preset.agent_radius if preset.core_radius is None else preset.core_radius
+        return flight_samples(data, self.task, preset.agent_radius, core)
+
+
+def _weights(folder: Path, name: str) -> Path:
+    return folder / f"spacecraft_{name}.safetensors"
+
+
+def _learning_error(network: DeepSet, samples: SetSamples) -> dict[str, Any]:
+    """Return ||a_L - a*|| in the plane, observed; the labels of one observation scatter."""
+    distance = np.linalg.norm(network(samples.features) - samples.target, axis=-1)
+    return {
+        "mean": float(distance.mean()),
+        "p99": float(np.quantile(distance, 0.99)),
+        "maximum": float(distance.max()),
+        "label_mean": float(np.linalg.norm(samples.target, axis=-1).mean()),
+        "samples": len(distance),
+        "unit": "m/s^2",
+        "kind": "observed",
+    }
+
+
+def _split(data: FlightData, share: float) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    every = max(2, round(1.0 / share))
+    return np.asarray(data.world % every == 0)
+
+
+def _training_part(data: FlightData, share: float) -> FlightData:
+    return _only(data, ~_split(data, share))
+
+
+def _held_out_part(data: FlightData, share: float) -> FlightData:
+    return _only(data, _split(data, share))
+
+
+def _only(data: FlightData, chosen: np.ndarray[Any, np.dtype[np.bool_]]) -> FlightData:
+    return FlightData(
+        data.observation[chosen],
+        data.acceleration[chosen],
+        data.world[chosen],
+        data.layout,
+        data.plans,
+        data.failed_plans,
+    )

@@ -1,0 +1,102 @@
+"""Pieces of data that depend on nothing but settings and index: resumable, in any process.
+
+A shard is written under a temporary name and renamed, so that whatever interrupts the work, every
+finished shard survives and the rest is made again, bit for bit.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.files import write_atomic
+
+Shard = dict[str, NDArray[Any]]
+
+
+def make_shards(
+    folder: Path,
+    count: int,
+    make: Callable[[int], Shard],
+    record: Mapping[str, Any],
+    jobs: int = 1,
+    on_shard: Callable[[int], None] | None = None,
+) -> list[Shard]:
+    """Make all shards, or those that an interrupted call left out.
+
+    Args:
+        folder: Where the shards are kept.
+        count: How many there are.
+        make: From the index of a shard to its arrays; sent to the processes.
+        record: What the data depend on; kept beside them.
+        jobs: Processes.
+        on_shard: Called with the number of shards that are finished.
+
+    Returns:
+        The shards in the order of their indices.
+
+    Raises:
+        ValueError: The folder holds data of another record, or a shard is damaged.
+    """
+    import joblib
+
+    folder.mkdir(parents=True, exist_ok=True)
+    claim(folder / "manifest.json", record, "expert data")
+    paths = [folder / f"shard_{index:04d}.npz" for index in range(count)]
+    missing = [index for index, path in enumerate(paths) if not path.exists()]
+    done = count - len(missing)
+    if on_shard is not None:
+        on_shard(done)
+    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
+    for _ in parallel(joblib.delayed(_write)(paths[index], make, index) for index in missing):
+        done += 1
+        if on_shard is not None:
+            on_shard(done)
+    return [read_shard(path) for path in paths]
+
+
+def read_shard(path: Path) -> Shard:
+    """Read a shard; nothing in it is executed.
+
+    Raises:
+        ValueError: The file is damaged.
+    """
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (zipfile.BadZipFile, EOFError, ValueError) as error:
+        raise ValueError(f"{path} is damaged ({error}); remove it, and it is made again") from error
+
+
+def claim(path: Path, record: Mapping[str, Any], what: str) -> None:
+    """Write the record of a folder, or check that it is the one that is there.
+
+    Args:
+        path: File of the record.
+        record: What the folder's content depends on.
+        what: Name of the content, for the error.
+
+    Raises:
+        ValueError: The folder belongs to another record.
+    """
+    plain = json.loads(json.dumps(record))
+    if not path.exists():
+        write_atomic(path, json.dumps(plain, indent=1) + "\n")
+    elif json.loads(path.read_text()) != plain:
+        raise ValueError(
+            f"{path.parent} holds {what} of other settings; name another folder or remove it"
+        )
+
+
+def _write(path: Path, make: Callable[[int], Shard], index: int) -> None:
+    buffer = io.BytesIO()
+    # Arrays that pickle would have to write are refused, not pickled.
+    np.savez(buffer, allow_pickle=False, **make(index))
+    write_atomic(path, buffer.getvalue())

@@ -1,0 +1,92 @@
+"""A spacecraft policy that is one evaluation of a deep set: the common body of (a) and (c)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs import spacecraft_task as task
+from lagros_envs.observation import Layout
+from lagros_envs.scenarios import Preset, preset_named
+from lagros_policies.contraction.thrusters import allocate
+from lagros_policies.imitation.deep_set import DeepSet
+from lagros_policies.imitation.network_policy import PRETRAINED
+from lagros_policies.imitation.spacecraft_features import SpacecraftFeatures, spacecraft_features
+from lagros_policies.policy import PolicyState
+from lagros_policies.sensed import Sensed
+
+Float32Array = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+
+
+class SpacecraftNetworkPolicy:
+    """Maps what an agent senses to its eight thrusters by one evaluation of a network.
+
+    The network answers with an acceleration in the frame of the goal; a turn into the body's axes
+    and a fixed last layer with ReLU, the allocation of least norm, make u >= 0 of it. Every row of
+    an observation is an agent of its own: all agents of all worlds fit in one call.
+
+    Args:
+        settings: The task.
+        preset: The preset, or its name: the size of observations and the radii of the bodies.
+        num_agents: Number of agents; None for the preset's own.
+        weights: A safetensors file written by `DeepSet.save`; the shipped one if left out.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is damaged, or its network is another one.
+    """
+
+    name: str = "network"
+    weights_file: str
+    observes: Literal["local", "global"] = "local"
+
+    def __init__(
+        self,
+        settings: task.SpacecraftSettings | None = None,
+        preset: str | Preset = "paper",
+        num_agents: int | None = None,
+        weights: Path | str | None = None,
+    ) -> None:
+        """Load the network."""
+        self.settings = settings or task.SpacecraftSettings()
+        self.preset = preset_named(preset).for_agents(num_agents)
+        self.layout = Layout.for_preset(self.preset, self.settings)
+        self.network = DeepSet.load(PRETRAINED / self.weights_file if weights is None else weights)
+        core = self.preset.core_radius
+        self._radii = self.preset.agent_radius, self.preset.agent_radius if core is None else core
+
+    def predict(
+        self,
+        observation: Float32Array,
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, PolicyState]:
+        """Evaluate the network for one agent (o,) or many (B, o); see `Policy.predict`."""
+        rows = np.asarray(observation, np.float32)
+        action = self.thrust(rows) * (1.0 / self.settings.thrust_scale)
+        return (action if rows.ndim == 2 else action[0]).astype(np.float32), state
+
+    def thrust(self, observation: Float32Array) -> FloatArray:
+        """Return u >= 0 of each agent, shape (B, 8) [N], for observations (B, o) or (o,)."""
+        sensed = Sensed.of(self.layout, observation)
+        features = self.features(sensed)
+        answer = self.network(features).astype(np.float64)
+        body = self.settings.system
+        # Into the world's axes, then into the body's, as complex numbers.
+        force = (answer[:, 0] + 1j * answer[:, 1]) * features.frame
+        force *= body.mass * np.exp(1j * sensed.heading)
+        torque = 2.0 * body.inertia * answer[:, 2]
+        return allocate(body, np.stack([force.real, force.imag, torque], axis=-1))
+
+    def features(self, sensed: Sensed) -> SpacecraftFeatures:
+        """Return the inputs of the network."""
+        return spacecraft_features(sensed, self.settings, *self._radii)
+
+    def bare_forward(self, features: SpacecraftFeatures) -> Float32Array:
+        """Evaluate the network alone, for timing."""
+        return self.network(features)

@@ -1,0 +1,328 @@
+"""Fit a deep set to expert flights; interrupted, it goes on from its last checkpoint."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_policies.imitation.deep_set import OUTPUTS, DeepSet
+from lagros_policies.imitation.networks import read_safetensors, write_safetensors
+from lagros_policies.imitation.spacecraft_features import (
+    NEIGHBOUR,
+    OBSTACLE,
+    OWN,
+    SpacecraftFeatures,
+    spacecraft_features,
+)
+from lagros_policies.imitation.spacecraft_flights import FlightData
+from lagros_policies.sensed import Sensed
+
+if TYPE_CHECKING:
+    import torch
+
+Float32Array = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class DeepSetTraining:
+    """How to fit.
+
+    Attributes:
+        element: Widths of the layers of phi_n and phi_o.
+        agent: Widths of the hidden layers of rho.
+        epochs: Passes over the data.
+        batch: Samples per step.
+        learning_rate: Adam's step at first; a cosine takes it to a hundredth of that.
+        checkpoint_every: Epochs between checkpoints.
+        seed: Seed of initial weights and sample order.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    element: tuple[int, ...] = (100, 100)
+    agent: tuple[int, ...] = (100, 100)
+    epochs: int = 6
+    batch: int = 1024
+    learning_rate: float = 2e-3
+    checkpoint_every: int = 1
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name in ("element", "agent"):
+            widths = getattr(self, name)
+            if not widths or min(widths) < 1:
+                raise ValueError(f"{name}={widths!r} must name at least one positive width")
+        if min(self.epochs, self.batch, self.checkpoint_every) < 1 or not self.learning_rate > 0.0:
+            raise ValueError("epochs, batch, checkpoint_every and learning_rate must be positive")
+
+
+@dataclass(frozen=True)
+class SetSamples:
+    """Features and labels of many agents.
+
+    Attributes:
+        features: Inputs of s samples.
+        target: Labels in the frame of the goal, shape (s, 3).
+        world: Which world each sample belongs to, shape (s,).
+    """
+
+    features: SpacecraftFeatures
+    target: Float32Array
+    world: IntArray
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self.target)
+
+
+def flight_samples(
+    data: FlightData, task: SpacecraftSettings, agent_radius: float, core_radius: float
+) -> SetSamples:
+    """Return features and labels of flights.
+
+    Args:
+        data: The flights.
+        task: Their task.
+        agent_radius: Radius of every agent against the others [m].
+        core_radius: Radius against obstacles [m].
+    """
+    sensed = Sensed.of(data.layout, data.observation)
+    features = spacecraft_features(sensed, task, agent_radius, core_radius)
+    plane = data.acceleration[:, 0] + 1j * data.acceleration[:, 1]
+    plane *= features.frame.conj()
+    target = np.stack([plane.real, plane.imag, data.acceleration[:, 2]], axis=-1)
+    return SetSamples(features, target.astype(np.float32), data.world)
+
+
+def join(parts: Sequence[SetSamples]) -> SetSamples:
+    """Return all samples in one; worlds of different parts stay different."""
+    offsets = np.cumsum([0] + [len(part) for part in parts])
+    worlds = np.cumsum([0] + [int(part.world.max(initial=-1)) + 1 for part in parts])
+    names = ("own", "neighbours", "neighbour_weight", "obstacles", "obstacle_weight", "frame")
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(part.features, name) for part in parts]) for name in names
+    }
+    for name in ("neighbour_owner", "obstacle_owner"):
+        joined[name] = np.concatenate(
+            [
+                getattr(part.features, name) + offset
+                for part, offset in zip(parts, offsets, strict=False)
+            ]
+        )
+    return SetSamples(
+        SpacecraftFeatures(**joined),
+        np.concatenate([part.target for part in parts]),
+        np.concatenate([part.world + first for part, first in zip(parts, worlds, strict=False)]),
+    )
+
+
+class _Ragged:
+    """The elements of each sample, to be picked by samples."""
+
+    def __init__(self, values: Float32Array, owner: IntArray, weight: Float32Array, count: int):
+        self.values, self.weight = values, weight
+        self.count = np.bincount(owner, minlength=count)
+        self.begin = np.cumsum(self.count) - self.count
+
+    def pick(self, samples: IntArray) -> tuple[Float32Array, IntArray, Float32Array]:
+        """Return values, owners among the samples, and weights."""
+        count = self.count[samples]
+        owner = np.repeat(np.arange(len(samples)), count)
+        within = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+        index = within + self.begin[samples][owner]
+        return self.values[index], owner, self.weight[index]
+
+
+def fit_deep_set(
+    samples: SetSamples,
+    settings: DeepSetTraining,
+    checkpoint: Path,
+    on_epoch: Callable[[int, float], None] | None = None,
+) -> DeepSet:
+    """Fit a network by Adam on the Huber loss of the scaled accelerations.
+
+    The labels of one observation scatter, because an agent does not sense what others plan; the
+    mean of the labels, which the square of small errors asks for, is what to do then.
+
+    Args:
+        samples: What to fit.
+        settings: How to fit.
+        checkpoint: File that holds the progress; resumed from if it fits.
+        on_epoch: Called with the epochs done and the last epoch's loss.
+
+    Returns:
+        The network, with the normalisation folded in.
+    """
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        run = _Run(samples, settings, checkpoint)
+        while run.epoch < settings.epochs:
+            loss = run.one_epoch()
+            if run.epoch % settings.checkpoint_every == 0 or run.epoch == settings.epochs:
+                run.save()
+            if on_epoch is not None:
+                on_epoch(run.epoch, loss)
+        return run.network()
+    finally:
+        torch.set_num_threads(threads)
+
+
+class _Run:
+    """One training run: model, optimiser and the number of epochs done."""
+
+    def __init__(self, samples: SetSamples, settings: DeepSetTraining, checkpoint: Path) -> None:
+        import torch
+
+        self.settings, self.checkpoint = settings, checkpoint
+        features, count = samples.features, len(samples)
+        self.scales = [
+            _statistics(values)
+            for values in (features.own, features.neighbours, features.obstacles)
+        ]
+        own, neighbours, obstacles = (
+            (values - mean) / deviation
+            for values, (mean, deviation) in zip(
+                (features.own, features.neighbours, features.obstacles), self.scales, strict=True
+            )
+        )
+        # One scale for the plane; the torque, which is easy, counts a third of it.
+        plane = float(np.sqrt(np.mean(samples.target[:, :2] ** 2)))
+        turn = float(np.sqrt(np.mean(samples.target[:, 2] ** 2)))
+        self.target_scale = np.array([plane, plane, max(3.0 * turn, 1e-3)], np.float32)
+        self.own, self.target = own, samples.target / self.target_scale
+        self.neighbours = _Ragged(
+            neighbours, features.neighbour_owner, features.neighbour_weight, count
+        )
+        self.obstacles = _Ragged(
+            obstacles, features.obstacle_owner, features.obstacle_weight, count
+        )
+        torch.manual_seed(settings.seed)
+        wide = settings.element[-1]
+        self.parts = [
+            _layers([len(NEIGHBOUR), *settings.element]),
+            _layers([len(OBSTACLE), *settings.element]),
+            _layers([len(OWN) + 2 * wide, *settings.agent, OUTPUTS])[:-1],
+        ]
+        self.parameters = [value for part in self.parts for value in part.parameters()]
+        self.optimiser = torch.optim.Adam(self.parameters, lr=settings.learning_rate)
+        self.epoch = 0
+        data = hashlib.sha256()
+        for array in (own, neighbours, obstacles, self.target):
+            data.update(np.ascontiguousarray(array).tobytes())
+        self._fingerprint = json.dumps({"settings": asdict(settings), "data": data.hexdigest()})
+        self._resume()
+
+    def one_epoch(self) -> float:
+        """Pass once over the data and return the mean loss."""
+        import torch
+
+        settings = self.settings
+        order = np.random.default_rng([settings.seed, self.epoch]).permutation(len(self.target))
+        batches = np.array_split(order, max(1, len(order) // settings.batch))
+        total = 0.0
+        for index, batch in enumerate(batches):
+            progress = (self.epoch + index / len(batches)) / settings.epochs
+            rate = settings.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
+            self.optimiser.param_groups[0]["lr"] = rate
+            target = torch.from_numpy(self.target[batch])
+            loss = torch.nn.functional.smooth_l1_loss(self._forward(batch), target)
+            self.optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            self.optimiser.step()
+            total += float(loss.detach()) * len(batch)
+        self.epoch += 1
+        return total / len(self.target)
+
+    def _forward(self, batch: IntArray) -> torch.Tensor:
+        import torch
+
+        inputs = [torch.from_numpy(self.own[batch])]
+        for part, elements in zip(self.parts, (self.neighbours, self.obstacles), strict=False):
+            values, owner, weight = (torch.from_numpy(a) for a in elements.pick(batch))
+            sums = torch.zeros(len(batch), self.settings.element[-1])
+            inputs.append(sums.index_add_(0, owner, part(values) * weight[:, None]))
+        answer: torch.Tensor = self.parts[2](torch.cat(inputs, 1))
+        return answer
+
+    def network(self) -> DeepSet:
+        """Return the network with the normalisation folded into its first and last layers."""
+        parts: list[list[tuple[FloatArray, FloatArray]]] = []
+        for module in self.parts:
+            state = [value.detach().numpy().astype(np.float64) for value in module.parameters()]
+            parts.append([(w.T, b) for w, b in zip(state[0::2], state[1::2], strict=True)])
+        for part, (mean, deviation), width in zip(
+            (parts[2], parts[0], parts[1]),
+            self.scales,
+            (len(OWN), len(NEIGHBOUR), len(OBSTACLE)),
+            strict=True,
+        ):
+            first = part[0][0].copy()
+            first[:width] /= deviation[:, None]
+            part[0] = first, part[0][1] - mean @ first[:width]
+        weight, bias = parts[2][-1]
+        parts[2][-1] = weight * self.target_scale, bias * self.target_scale
+        return DeepSet(parts[0], parts[1], parts[2])
+
+    def save(self) -> None:
+        """Write model and optimiser; safetensors, so that a checkpoint holds no code."""
+        tensors: dict[str, Any] = {}
+        for index, parameter in enumerate(self.parameters):
+            slots = self.optimiser.state[parameter]
+            tensors[f"{index}.value"] = parameter.detach().numpy()
+            tensors[f"{index}.mean"] = slots["exp_avg"].numpy()
+            tensors[f"{index}.square"] = slots["exp_avg_sq"].numpy()
+            tensors[f"{index}.step"] = np.array([float(slots["step"])], np.float32)
+        metadata = {"fingerprint": self._fingerprint, "epoch": str(self.epoch)}
+        write_safetensors(self.checkpoint, tensors, metadata)
+
+    def _resume(self) -> None:
+        import torch
+
+        if not self.checkpoint.exists():
+            return
+        tensors, metadata = read_safetensors(self.checkpoint)
+        if metadata.get("fingerprint") != self._fingerprint:
+            raise ValueError(
+                f"{self.checkpoint} belongs to other settings or data; remove it to start anew"
+            )
+        self.epoch = int(metadata["epoch"])
+        with torch.no_grad():
+            for index, parameter in enumerate(self.parameters):
+                parameter.copy_(torch.from_numpy(tensors[f"{index}.value"]))
+                self.optimiser.state[parameter] = {
+                    "step": torch.tensor(float(tensors[f"{index}.step"][0])),
+                    "exp_avg": torch.from_numpy(tensors[f"{index}.mean"].copy()),
+                    "exp_avg_sq": torch.from_numpy(tensors[f"{index}.square"].copy()),
+                }
+
+
+def _layers(widths: list[int]) -> torch.nn.Sequential:
+    import torch
+
+    layers: list[torch.nn.Module] = []
+    for width, following in itertools.pairwise(widths):
+        layers += [torch.nn.Linear(width, following), torch.nn.ReLU()]
+    return torch.nn.Sequential(*layers)
+
+
+def _statistics(values: Float32Array) -> tuple[Float32Array, Float32Array]:
+    mean = values.mean(axis=0, dtype=np.float64).astype(np.float32)
+    deviation = values.std(axis=0, dtype=np.float64).astype(np.float32)
+    return mean, np.maximum(deviation, np.float32(1e-3))

@@ -1,0 +1,390 @@
+"""The plan of one agent among what it senses: sequential convex programming, small and dense.
+
+    min  1/2 int ||F||^2 dt + sum_k phi(s_k)
+    s.t. dp/dt = v, dv/dt = F / m, F held over each step, from the given state to rest at the goal,
+         |v| <= v_max, ||p(t_k) - c_j(t_k)|| >= R_j(t_k) - s_k, s_k >= 0
+
+c_j is an obstacle, or another agent extrapolated at constant velocity. The plan always reaches to
+the goal, with short steps as far as others can be foreseen and long ones after that, so that its
+size does not depend on the time that remains. The distances are linearised as in `joint_scp`; all
+may be violated at the price phi(s) = w_1 s + w_2 s^2 / 2, whose second term keeps an agent in the
+middle of a passage too narrow for its margins. So a plan always exists, and says what it lacks.
+
+Positions are affine in the forces, p(t) = p_0 + v_0 t + Phi(t) F for each axis alike, which leaves
+the forces and the shortfalls as unknowns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import piqp
+from numpy.typing import NDArray
+
+from lagros_policies.planning.grid_path import walk
+from lagros_policies.planning.local_guess import pass_aside, progress, way_around
+from lagros_policies.planning.local_motion import Discs, LocalPlan, responses
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_UNBOUNDED = 1e30
+# Distances are planned wider by this, so that they are kept between the instants too [m].
+_SPARE = 0.01
+# Instants where distances are imposed: at most this far apart, near and far ahead [s].
+_NEAR_INSTANTS, _FAR_INSTANTS = 0.25, 0.5
+# Room that even a body which covers the goal keeps beyond touching [m].
+_LEAST_ROOM = 0.02
+# An agent that lets others go first waits for this share of the foresight.
+_PAUSE = 0.7
+# Look for another way when the plan in force has become dearer by this much [N^2 s].
+_DEARER = 5e-3
+
+
+@dataclass(frozen=True, slots=True)
+class LocalPlannerSettings:
+    """The size of the programs and how hard to look.
+
+    Attributes:
+        mass: m [kg].
+        near_period: Length of the first steps [s].
+        near_steps: How many of them; others are heeded as long as these last.
+        far_steps: Steps over the rest of the time.
+        least_duration: No plan is shorter [s].
+        speed_limit: Largest speed per axis at the nodes [m/s].
+        margin_growth: Where the start lies inside a margin, the acceleration at which the margin
+            grows from what there is [m/s^2].
+        passes: Quadratic programs per guess at most.
+        tolerance: Shortfall of a distance that counts as none [m].
+        effort_tolerance: Stop when the cost falls by less than this share in one pass.
+        penalty: w_1 [N^2 s / m].
+        quadratic_penalty: w_2 [N^2 s / m^2].
+        reach: A distance is imposed where the last pass is nearer than it plus this [m].
+        most_distances: How many distances one program may impose; bounds the time that it takes.
+        deadband: Two that meet pass on the right unless the miss distance is further left [m].
+        change: A new way is taken when it costs less than this share of the plan in force.
+        qp_tolerance: Residual of the quadratic programs.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    mass: float = 1.0
+    near_period: float = 0.5
+    near_steps: int = 12
+    far_steps: int = 8
+    least_duration: float = 8.0
+    speed_limit: float = 0.7
+    margin_growth: float = 0.05
+    passes: int = 4
+    tolerance: float = 0.01
+    effort_tolerance: float = 0.02
+    penalty: float = 1.0
+    quadratic_penalty: float = 4.0
+    reach: float = 0.4
+    most_distances: int = 80
+    deadband: float = 0.2
+    change: float = 0.8
+    qp_tolerance: float = 1e-6
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{item.name}={value!r} must be finite and >= 0")
+        for name in ("mass", "near_period", "speed_limit", "penalty", "qp_tolerance"):
+            if getattr(self, name) == 0.0:
+                raise ValueError(f"{name}=0.0 must be > 0")
+        # The second pass is the first that may know of the speed limit.
+        for name, least in (
+            ("near_steps", 1),
+            ("far_steps", 1),
+            ("passes", 2),
+            ("most_distances", 1),
+        ):
+            value = getattr(self, name)
+            if value != int(value) or value < least:
+                raise ValueError(f"{name}={value!r} must be a whole number >= {least}")
+        if self.least_duration <= self.foresight:
+            raise ValueError(
+                f"least_duration={self.least_duration!r} must exceed the {self.near_steps} steps "
+                f"of {self.near_period} s for which others are heeded"
+            )
+
+    @property
+    def foresight(self) -> float:
+        """How far ahead others that move are heeded [s]."""
+        return self.near_period * self.near_steps
+
+
+class LocalPlanner:
+    """Plans the motion of one agent.
+
+    Args:
+        settings: How.
+    """
+
+    def __init__(self, settings: LocalPlannerSettings | None = None) -> None:
+        """Remember the settings."""
+        self.settings = settings or LocalPlannerSettings()
+
+    def plan(
+        self,
+        start: FloatArray,
+        goal: FloatArray,
+        discs: Discs,
+        left: float,
+        last: LocalPlan | None = None,
+        elapsed: float = 0.0,
+        fresh: bool = True,
+    ) -> LocalPlan:
+        """Plan from a state to rest at the goal.
+
+        Args:
+            start: [p, v], shape (4,) [m, m/s].
+            goal: Position, shape (2,) [m].
+            discs: What to keep away from.
+            left: Time until the agent should have arrived [s]; may be negative, for it is late.
+            last: The plan in force; the guess that is tried first.
+            elapsed: Time since that plan began [s].
+            fresh: Whether to look for another way too, as is done whenever the last one is short.
+
+        Returns:
+            The best plan found. Where every program failed, `solved` is False and the forces are 0.
+        """
+        problem = _Problem(self.settings, start, goal, discs, left)
+        best: LocalPlan | None = None
+        programs = 0
+        if last is not None:
+            guess, _ = last.at(problem.times + elapsed)
+            aside = problem.aside(guess)
+            best = problem.solve(aside)
+            programs = best.programs
+            fresh = fresh or best.cost > last.cost + _DEARER
+        if best is None or fresh or not best.solved or best.short > self.settings.tolerance:
+            for guess in problem.ways():
+                found = problem.solve(guess)
+                programs += found.programs
+                if best is None or found.cost < self.settings.change * best.cost:
+                    best = found
+        assert best is not None  # there is always a way
+        return replace(best, programs=programs)
+
+
+class _Problem:
+    """The arrays of one call."""
+
+    def __init__(
+        self,
+        settings: LocalPlannerSettings,
+        start: FloatArray,
+        goal: FloatArray,
+        discs: Discs,
+        left: float,
+    ) -> None:
+        self.settings, self.start, self.goal, self.discs = settings, start, goal, discs
+        far = float(np.max(np.abs(goal - start[:2])))
+        # From rest to rest the largest speed is 3/2 of the mean; the rest is leave for detours.
+        duration = max(left, settings.least_duration, 2.0 * far / settings.speed_limit)
+        near = settings.near_period * np.arange(settings.near_steps)
+        self.edges = np.concatenate(
+            [near, np.linspace(settings.foresight, duration, settings.far_steps + 1)]
+        )
+        self.times, self.node = _instants(self.edges, settings.foresight)
+        self.place, _ = responses(self.edges, self.times, settings.mass)
+        self.speed = responses(self.edges, self.edges[1:-1], settings.mass)[1]
+        self.free = start[:2] + self.times[:, None] * start[2:]
+        self.discs_at = discs.centres + self.times[:, None, None] * discs.velocities
+        self.heeded = (self.times[:, None] <= settings.foresight + 1e-9) | ~discs.moving
+        # Nothing can be imposed at the ends, which are given.
+        self.heeded[[0, -1]] = False
+        self.required = self._required(left)
+        self.limit = np.maximum(settings.speed_limit, np.abs(start[2:]))
+
+    def _required(self, left: float) -> FloatArray:
+        """Return the distances to keep, (K, m): less near ends that lack room."""
+        growth = 0.5 * self.settings.margin_growth
+        discs = self.discs
+        full = discs.touching + discs.margins + _SPARE
+        gap = np.linalg.norm(self.start[:2] - discs.centres, axis=-1)
+        required = np.minimum(full, gap + growth * self.times[:, None] ** 2)
+        # A body may cover the margin of the goal. One that moves is left time to be gone.
+        room = np.linalg.norm(self.goal - discs.centres, axis=-1)
+        room = np.maximum(room, discs.touching + _LEAST_ROOM)
+        room = np.where(discs.moving & (left > 0.0), np.inf, room)
+        remaining = np.maximum(left - self.times, 0.0)
+        value: FloatArray = np.minimum(required, room + growth * remaining[:, None] ** 2)
+        return value
+
+    def ways(self) -> Iterator[FloatArray]:
+        """Yield guesses (K, 2): around what rests, passing others right, left, or after them."""
+        discs, still = self.discs, ~self.discs.moving
+        begin, speed = self.start[:2], self.start[2:]
+        distance = np.max(self.required, axis=0, initial=0.0)[still]
+        path = way_around(begin, self.goal, discs.centres[still], distance)
+        legs = np.diff(path, axis=0)
+        size = np.linalg.norm(legs, axis=1)
+        along = float(speed @ legs[0]) / max(float(size[0]), 1e-9)
+        length = float(np.sum(size))
+        guess = walk(path, progress(self.times, length, along))
+        right = self.aside(guess)
+        yield right
+        if not np.array_equal(right, guess):
+            yield self.aside(guess, left=True)
+            # Let the others go first: stand for most of the foresight.
+            pause = _PAUSE * self.settings.foresight
+            later = np.maximum(self.times - pause, 0.0)
+            yield walk(path, progress(later, length, 0.0))
+
+    def aside(self, guess: FloatArray, left: bool = False) -> FloatArray:
+        """Return a guess that passes those who move on one side."""
+        meets = self.heeded & self.discs.moving
+        deadband = self.settings.deadband
+        return pass_aside(guess, self.discs_at, self.required, meets, deadband, left)
+
+    def solve(self, guess: FloatArray) -> LocalPlan:
+        """Iterate from a guess (K, 2)."""
+        settings = self.settings
+        places, count = guess, 0
+        limited = False
+        best = LocalPlan(
+            self.edges,
+            self.start,
+            np.zeros((len(self.edges) - 1, 2)),
+            settings.mass,
+            math.inf,
+            math.inf,
+            False,
+            0,
+        )
+        for _ in range(settings.passes):
+            forces = self._program(places, limited)
+            count += 1
+            if forces is None:
+                break
+            speeds = self.start[2:] + self.speed @ forces
+            if not limited and np.any(np.abs(speeds) > self.limit + 1e-6):
+                # Most plans are slower than the limit, and the programs half the size without it.
+                limited = True
+                continue
+            places = self.free + self.place @ forces
+            short, cost = self._judge(forces, places)
+            gain = best.cost - cost
+            if cost < best.cost:
+                best = replace(best, forces=forces, short=short, cost=cost, solved=True)
+            if not gain > settings.effort_tolerance * cost:
+                break
+        return replace(best, programs=count)
+
+    def _judge(self, forces: FloatArray, places: FloatArray) -> tuple[float, float]:
+        """Return the largest shortfall and the cost of a motion."""
+        settings = self.settings
+        apart = np.linalg.norm(places[:, None] - self.discs_at, axis=-1)
+        short = np.where(self.heeded, np.maximum(self.required - apart, 0.0), 0.0)
+        price = settings.penalty * short + 0.5 * settings.quadratic_penalty * short**2
+        effort = 0.5 * float(np.diff(self.edges) @ np.sum(forces**2, axis=1))
+        return float(np.max(short, initial=0.0)), effort + float(np.sum(price))
+
+    def _program(self, places: FloatArray, limited: bool) -> FloatArray | None:
+        """Solve the quadratic program around positions (K, 2); None if the solver failed."""
+        settings, steps = self.settings, len(self.edges) - 1
+        delta = places[:, None] - self.discs_at
+        apart = np.linalg.norm(delta, axis=-1)
+        reach = np.where(self.node, settings.reach, 0.5 * settings.reach)
+        room = np.where(self.heeded, apart - self.required - reach[:, None], np.inf)
+        instant, disc = np.nonzero(room < 0.0)
+        if len(instant) > settings.most_distances:
+            # The tightest; what this leaves out another pass may bring in.
+            tightest = np.argsort(room[instant, disc], kind="stable")[: settings.most_distances]
+            instant, disc = instant[tightest], disc[tightest]
+        normal = _unit(delta[instant, disc], apart[instant, disc])
+        rows = len(instant)
+        size = 2 * steps + rows
+        away = self.free[instant] - self.discs_at[instant, disc]
+        low = self.required[instant, disc] - np.sum(normal * away, axis=-1)
+        high = np.full(rows, _UNBOUNDED)
+        inequality = np.zeros((rows, size))
+        inequality[:, :steps] = normal[:, :1] * self.place[instant]
+        inequality[:, steps : 2 * steps] = normal[:, 1:] * self.place[instant]
+        inequality[:, 2 * steps :] = np.eye(rows)
+        if limited:
+            bound = np.zeros((2 * len(self.speed), size))
+            bound[: len(self.speed), :steps] = self.speed
+            bound[len(self.speed) :, steps : 2 * steps] = self.speed
+            limit, now = (np.repeat(part, len(self.speed)) for part in (self.limit, self.start[2:]))
+            inequality = np.vstack([inequality, bound])
+            low, high = np.concatenate([low, -limit - now]), np.concatenate([high, limit - now])
+        diagonal = np.full(size, settings.quadratic_penalty)
+        diagonal[: 2 * steps] = np.tile(np.diff(self.edges), 2)
+        linear = np.zeros(size)
+        linear[2 * steps :] = settings.penalty
+        least = np.full(size, -_UNBOUNDED)
+        least[2 * steps :] = 0.0
+        equality, target = self._arrival(size)
+        values = _solve(
+            diagonal, linear, equality, target, inequality, low, high, least, settings.qp_tolerance
+        )
+        return None if values is None else values[: 2 * steps].reshape(2, steps).T
+
+    def _arrival(self, size: int) -> tuple[FloatArray, FloatArray]:
+        """Return the equalities that end the plan at rest at the goal."""
+        steps = len(self.edges) - 1
+        place, speed = responses(self.edges, self.edges[-1:], self.settings.mass)
+        both = np.vstack([place, speed])
+        equality = np.zeros((4, size))
+        equality[:2, :steps] = equality[2:, steps : 2 * steps] = both
+        free = self.start[:2] + self.edges[-1] * self.start[2:]
+        target = np.stack([self.goal - free, -self.start[2:]], axis=1).ravel()
+        return equality, target
+
+
+def _instants(edges: FloatArray, foresight: float) -> tuple[FloatArray, BoolArray]:
+    """Return where distances are looked at, (K,) [s], and which of them are nodes."""
+    spacing = np.where(edges[1:] <= foresight + 1e-9, _NEAR_INSTANTS, _FAR_INSTANTS)
+    counts = np.maximum(np.ceil(np.diff(edges) / spacing - 1e-9), 1).astype(int)
+    share = np.concatenate([np.arange(count) / count for count in counts])
+    times = np.repeat(edges[:-1], counts) + share * np.repeat(np.diff(edges), counts)
+    return np.append(times, edges[-1]), np.append(share == 0.0, True)
+
+
+def _solve(
+    diagonal: FloatArray,
+    linear: FloatArray,
+    equality: FloatArray,
+    target: FloatArray,
+    inequality: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    least: FloatArray,
+    tolerance: float,
+) -> FloatArray | None:
+    """Return the optimum of a dense program with PIQP, or None if it fails."""
+    solver = piqp.DenseSolver()
+    solver.settings.eps_abs = solver.settings.eps_rel = tolerance
+    solver.settings.check_duality_gap = False
+    solver.setup(
+        np.diag(diagonal),
+        linear,
+        equality,
+        target,
+        inequality,
+        low,
+        high,
+        least,
+        np.full(len(linear), _UNBOUNDED),
+    )
+    status = solver.solve()
+    values = np.array(solver.result.x)
+    return values if status == piqp.PIQP_SOLVED and np.all(np.isfinite(values)) else None
+
+
+def _unit(delta: FloatArray, length: FloatArray) -> FloatArray:
+    """Return unit vectors (r, 2); where the length vanishes, a fixed one."""
+    small = length < 1e-9
+    unit: FloatArray = delta / np.where(small, 1.0, length)[:, None]
+    unit[small] = (0.0, 1.0)
+    return unit
