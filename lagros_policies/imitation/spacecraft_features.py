@@ -9,6 +9,7 @@ Vectors are complex numbers here: a turn is one product.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,9 +88,8 @@ def spacecraft_features(
     """
     goal = _complex(sensed.goal)
     distance = np.abs(goal)
-    frame: ComplexArray = np.where(distance > _SMALL, goal, 1.0 + 0.0j) / np.where(
-        distance > _SMALL, distance, 1.0
-    )
+    far = distance > _SMALL
+    frame = cast(ComplexArray, np.where(far, goal, 1.0) / np.where(far, distance, 1.0))
     back = frame.conj()
     velocity = _complex(sensed.velocity) * back
     left = np.maximum(settings.horizon - sensed.time, 0.0)
