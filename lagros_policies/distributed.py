@@ -44,8 +44,10 @@ class DistributedState:
         map: What it has sensed, in axes whose origin is its goal.
         plan: The plan in force; None before the first.
         age: Control steps since that plan began.
+        unchecked: Control steps since it was found or confirmed.
         time: t of the last call [s].
         plans: Plans asked for.
+        confirmed_plans: Times that the plan in force was found to hold, and kept.
         infeasible_plans: Plans that fall short of a distance that they were asked to keep.
         broken_plans: Plans for which the solver found nothing; the last one stayed in force.
         closest: Least distance to the goal so far [m], in steps of what counts as progress.
@@ -57,8 +59,10 @@ class DistributedState:
     map: LocalMap = field(default_factory=LocalMap)
     plan: LocalPlan | None = None
     age: int = 0
+    unchecked: int = 0
     time: float = -math.inf
     plans: int = 0
+    confirmed_plans: int = 0
     infeasible_plans: int = 0
     broken_plans: int = 0
     closest: float = math.inf
@@ -150,6 +154,10 @@ class DistributedTubeMpcPolicy:
                 f"the planner is for mass={planner.mass!r}; the task has {body.mass!r}"
             )
         self.planner = LocalPlanner(planner)
+        import os
+        global _KEPT_FOR, _FRESH_EVERY
+        _KEPT_FOR = float(os.environ.get("KF", "2.0")); self.kept_short=float(os.environ.get("KS","0.02"))
+        _FRESH_EVERY = int(os.environ.get("FE","5"))
 
     def predict(
         self,
@@ -223,8 +231,9 @@ class DistributedTubeMpcPolicy:
         memory.time = now
         if memory.plan is not None:
             memory.age += 1
-        if memory.plan is None or news or memory.age >= self.replan_every:
-            self._renew(own, now, memory)
+            memory.unchecked += 1
+        if memory.plan is None or news or memory.unchecked >= self.replan_every:
+            self._confirm_or_renew(own, now, memory)
         plan = memory.plan
         if plan is None:
             # Nothing was ever found: hold the position.
@@ -249,15 +258,28 @@ class DistributedTubeMpcPolicy:
         memory.stuck = away and now - memory.closest_time > _PATIENCE
         memory.stuck_steps += memory.stuck
 
-    def _renew(self, own: FloatArray, now: float, memory: DistributedState) -> None:
+    def _confirm_or_renew(self, own: FloatArray, now: float, memory: DistributedState) -> None:
+        """Keep the plan in force if it still keeps its distances, else plan anew."""
+        plan, elapsed = memory.plan, memory.age * self.settings.control_period
+        left = self.settings.horizon - now
+        discs = self._discs(memory.map)
+        memory.unchecked = 0
+        if plan is not None and elapsed < _KEPT_FOR and plan.short <= self.kept_short:
+            short = self.planner.shortfall(plan, elapsed, np.zeros(2), discs, left)
+            if short <= self.kept_short:
+                memory.confirmed_plans += 1
+                return
+        self._renew(own, left, discs, memory)
+
+    def _renew(
+        self, own: FloatArray, left: float, discs: Discs, memory: DistributedState
+    ) -> None:
         """Plan from the nominal state, or from the sensed one at first."""
         last, elapsed = memory.plan, memory.age * self.settings.control_period
         start = own
         if last is not None:
             start = np.concatenate([part[0] for part in last.at(np.array([elapsed]))])
         fresh = memory.plans % _FRESH_EVERY == 0
-        left = self.settings.horizon - now
-        discs = self._discs(memory.map)
         plan = self.planner.plan(start, np.zeros(2), discs, left, last, elapsed, fresh)
         memory.plans += 1
         if not plan.solved:
@@ -271,7 +293,7 @@ class DistributedTubeMpcPolicy:
         preset = self.preset
         core = preset.agent_radius if preset.core_radius is None else preset.core_radius
         counts = len(obstacles), len(neighbours)
-        speed = np.linalg.norm(neighbours[:, 2:], axis=1)
+        speed = np.hypot(neighbours[:, 2], neighbours[:, 3])
         moving = speed > self.still
         velocities = np.zeros((sum(counts), 2))
         velocities[counts[0] :] = np.where(moving[:, None], neighbours[:, 2:], 0.0)

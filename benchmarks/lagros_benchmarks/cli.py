@@ -10,15 +10,17 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
 
+from lagros_benchmarks.watch import watch
+
 if TYPE_CHECKING:
     from lagros_benchmarks.records import Row
-    from lagros_benchmarks.runner import BenchmarkRun, Progress
+    from lagros_benchmarks.report import Outputs
+    from lagros_benchmarks.runner import Progress
     from lagros_benchmarks.settings import BenchmarkSettings
 
 USAGE_ERROR = 2
@@ -40,62 +42,6 @@ def _file(explanation: str) -> Any:
     return typer.Option(metavar="FILE", dir_okay=False, help=explanation)
 
 
-@dataclass(frozen=True)
-class Outputs:
-    """Where the results of a run go; None leaves one out.
-
-    Attributes:
-        json: All figures of the run, a list with one object per policy and condition.
-        csv: The scalar ones.
-        latex: The table.
-        markdown: The table; success by condition if there are several.
-        figure: The error figure of one condition, or the success figure of several.
-        episodes: Every episode, one JSON object a line.
-    """
-
-    json: Path | None = None
-    csv: Path | None = None
-    latex: Path | None = None
-    markdown: Path | None = None
-    figure: Path | None = None
-    episodes: Path | None = None
-
-    def check(self) -> None:
-        """Check the files before the run and not after it.
-
-        Raises:
-            ValueError: A folder cannot be made, or a figure has an unknown suffix.
-        """
-        if self.figure is not None:
-            from lagros_benchmarks.figures import check_figure_path
-
-            check_figure_path(self.figure)
-        for path in (self.json, self.csv, self.latex, self.markdown, self.figure, self.episodes):
-            if path is None:
-                continue
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise ValueError(f"cannot write {str(path)!r}: {error.strerror}") from error
-
-    def write(self, run: BenchmarkRun, rows: list[Row]) -> Iterator[Path]:
-        """Write the files, and yield the path of each."""
-        from lagros_benchmarks import figures, files, records, tables
-
-        if self.json is not None:
-            yield files.write_json(self.json, rows)
-        if self.csv is not None:
-            yield files.write_atomic(self.csv, tables.csv_text(rows))
-        if self.latex is not None:
-            yield files.write_atomic(self.latex, tables.latex_text(rows))
-        if self.markdown is not None:
-            yield files.write_atomic(self.markdown, tables.markdown_text(rows))
-        if self.episodes is not None:
-            yield files.write_json_lines(self.episodes, records.episode_objects(run))
-        if self.figure is not None:
-            yield figures.draw(rows, self.figure)
-
-
 def fail(error: Exception | str, status: int = USAGE_ERROR) -> NoReturn:
     """Say what is wrong, without a traceback, and end with the exit status."""
     typer.echo(f"lagros: {error}", err=True)
@@ -113,8 +59,15 @@ def listed(text: str, convert: Callable[[str], Value], option: str) -> tuple[Val
         try:
             values.append(convert(entry))
         except ValueError:
-            raise ValueError(f"{option}: {entry!r} is not a number") from None
+            kind = "a whole number" if convert is int else "a number"
+            raise ValueError(f"{option}: {entry!r} is not {kind}") from None
     return tuple(values)
+
+
+def _listed_or_none(
+    text: str | None, convert: Callable[[str], Value], option: str
+) -> tuple[Value, ...] | None:
+    return None if text is None else listed(text, convert, option)
 
 
 @app.callback(invoke_without_command=True)
@@ -131,16 +84,18 @@ def main(
 
 @app.command()
 def bench(
-    task: Annotated[str, typer.Argument(help="cartpole (spacecraft is to come).")],
+    task: Annotated[str, typer.Argument(help="cartpole, or spacecraft.")],
     policies: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="NAME[,NAME]",
-            help="Of learned, tube-mpc, lagros, lqr, random, ppo, a stable-baselines3 .zip, or "
-            "module:Class.",
+            help="cartpole: of learned, tube-mpc, lagros, lqr, random, ppo. spacecraft: of "
+            "learned, tube-mpc, lagros, centralized. Or a stable-baselines3 .zip, or module:Class.",
         ),
-    ] = "learned,tube-mpc,lagros,lqr",
-    episodes: Annotated[int, typer.Option(help="Episodes of each policy and condition.")] = 50,
+    ] = None,
+    episodes: Annotated[
+        int | None, typer.Option(help="Episodes (worlds) of each policy and condition; 50.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed; its episodes never occur in training.")] = 0,
     disturbance: Annotated[
         str,
@@ -150,53 +105,85 @@ def bench(
         ),
     ] = "uniform",
     bound: Annotated[
-        str,
+        str | None,
         typer.Option(
-            metavar="D[,D]", help="Bounds d̄ of the disturbance, in units of the state per second."
+            metavar="D[,D]",
+            help="Bounds d̄ of the disturbance, in units of the state per second. cartpole: 0.75; "
+            "spacecraft: 0.2,0.4,0.6,0.8,1.0.",
         ),
-    ] = "0.75",
+    ] = None,
     channels: Annotated[str, typer.Option(help="Disturbed states: all, or rates.")] = "all",
+    agents: Annotated[
+        str | None,
+        typer.Option(metavar="N[,N]", help="Spacecraft in a world, 6; several compare them."),
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help="Spacecraft: paper, released, crossing, open or swarm."),
+    ] = None,
+    safety_filter: Annotated[
+        str | None,
+        typer.Option(help="Spacecraft: none, all (policies wear it) or both; both."),
+    ] = None,
     jobs: Annotated[
         int, typer.Option(help="Worker processes; Δt is then measured in a serial pass after.")
     ] = 1,
-    timing_episodes: Annotated[int, typer.Option(help="Episodes of that pass.")] = 10,
+    timing_episodes: Annotated[
+        int, typer.Option(help="Episodes of that pass, which spacecraft always have.")
+    ] = 10,
     replan_every: Annotated[
-        int, typer.Option(help="Control steps between the plans of tube-mpc.")
-    ] = 1,
+        int | None, typer.Option(help="cartpole: control steps between the plans of tube-mpc, 1.")
+    ] = None,
     json: Annotated[Path | None, _file("All figures, one object per policy and condition.")] = None,
     csv: Annotated[Path | None, _file("The scalar figures.")] = None,
     latex: Annotated[Path | None, _file("The table, for LaTeX with booktabs.")] = None,
     markdown: Annotated[Path | None, _file("The table, as Markdown.")] = None,
     figure: Annotated[
         Path | None,
-        _file("Error over time; success against the bound if there are several conditions."),
+        _file(
+            "cartpole: error over time, or success against the bound. spacecraft: success and "
+            "effort, against the bound; against the number of agents success and time."
+        ),
     ] = None,
-    episodes_file: Annotated[Path | None, _file("Every episode, as JSON Lines.")] = None,
+    scene: Annotated[
+        Path | None, _file("Spacecraft: trajectories of every policy in one world.")
+    ] = None,
+    scene_world: Annotated[int, typer.Option(help="Which of the run's worlds, from 0.")] = 0,
+    episodes_file: Annotated[
+        Path | None, _file("Every episode (every agent), as JSON Lines.")
+    ] = None,
 ) -> None:
     """Compare policies on the same episodes; print the table, write what is asked for."""
-    from lagros_benchmarks.settings import BenchmarkSettings, check_policy
+    from lagros_benchmarks.report import Outputs
+    from lagros_benchmarks.settings import BenchmarkSettings, check_policy, check_task
 
-    outputs = Outputs(json, csv, latex, markdown, figure, episodes_file)
+    outputs = Outputs(json, csv, latex, markdown, figure, episodes_file, scene, scene_world)
     # A policy of the user's own, module:Class, lies in the folder that lagros is run from.
     sys.path.insert(0, os.getcwd())
     try:
-        names = listed(policies, str, "--policies")
-        planner = {"tube-mpc": {"replan_every": replan_every}} if replan_every != 1 else {}
-        settings = BenchmarkSettings(
-            task=task,
-            policies=names,
-            policy_settings=planner,
+        check_task(task)
+        if replan_every is not None and task != "cartpole":
+            raise ValueError(f"--replan-every is for cartpole; leave it out for {task}")
+        settings = BenchmarkSettings.for_task(
+            task,
+            policies=_listed_or_none(policies, str, "--policies"),
+            policy_settings=None
+            if replan_every is None
+            else {"tube-mpc": {"replan_every": replan_every}},
             episodes=episodes,
             seed=seed,
             disturbances=listed(disturbance, str, "--disturbance"),
-            bounds=listed(bound, float, "--bound"),
+            bounds=_listed_or_none(bound, float, "--bound"),
             channels=channels,
+            agents=_listed_or_none(agents, int, "--agents"),
+            preset=preset,
+            safety_filter=safety_filter,
             jobs=jobs,
             timing_episodes=timing_episodes,
         )
         for name in settings.policies:
-            check_policy(name)
-        outputs.check()
+            check_policy(name, task)
+        outputs.check(task, settings.episodes)
     except ValueError as error:
         fail(error)
     run_and_report(settings, outputs)
@@ -205,6 +192,7 @@ def bench(
 @app.command()
 def demo() -> None:
     """The paper's cart-pole experiment: 50 paired episodes, the table and the figure."""
+    from lagros_benchmarks.report import Outputs
     from lagros_benchmarks.settings import BenchmarkSettings
 
     outputs = Outputs(json=DEMO_FOLDER / "results.json", figure=DEMO_FOLDER / "error.png")
@@ -213,30 +201,66 @@ def demo() -> None:
 
 @app.command()
 def reproduce(
-    task: Annotated[str, typer.Argument(help="cartpole (spacecraft is to come).")],
+    task: Annotated[str, typer.Argument(help="cartpole or spacecraft.")],
     folder: Annotated[
-        Path, typer.Option("--out", file_okay=False, help="Where the run is kept and resumed.")
-    ] = Path("runs/reproduce-cartpole"),
+        Path | None,
+        typer.Option(
+            "--out",
+            file_okay=False,
+            help="Where the run is kept and resumed; runs/reproduce-TASK if left out.",
+        ),
+    ] = None,
     jobs: Annotated[int, typer.Option(help="Worker processes; they change no result.")] = 2,
-    episodes: Annotated[int, typer.Option(help="Episodes of each policy in the table.")] = 50,
+    episodes: Annotated[
+        int | None,
+        typer.Option(help="Episodes (worlds) of each policy in the table; 50, spacecraft 20."),
+    ] = None,
+    shipped: Annotated[
+        bool, typer.Option("--shipped-weights", help="Only the benchmark, with what is shipped.")
+    ] = False,
 ) -> None:
-    """From nothing to the table: metric, expert data, training, benchmark, figure."""
-    from lagros_benchmarks.reproduce import ReproduceSettings, reproduce_cartpole
+    """From nothing to the table and figures: metric or expert, data, training, benchmark."""
     from lagros_benchmarks.settings import check_task
 
+    place = folder or Path(f"runs/reproduce-{task}")
     try:
         check_task(task)
-        settings = ReproduceSettings(jobs=jobs, episodes=episodes)
         with progress_bar() as progress:
-            benchmark = reproduce_cartpole(folder, settings, progress, progress_line)
+            if task == "cartpole":
+                from lagros_benchmarks.reproduce import ReproduceSettings, reproduce_cartpole
+
+                made = ReproduceSettings(jobs=jobs, episodes=episodes or 50)
+                benchmark = (
+                    made.shipped_benchmark
+                    if shipped
+                    else reproduce_cartpole(place, made, progress, progress_line)
+                )
+            else:
+                from lagros_benchmarks import reproduce_spacecraft as spacecraft
+
+                wanted = spacecraft.SpacecraftReproduceSettings(jobs=jobs, worlds=episodes or 20)
+                benchmark = (
+                    wanted.benchmark(None)
+                    if shipped
+                    else spacecraft.reproduce_spacecraft(place, wanted, progress, progress_line)
+                )
     except ValueError as error:
         fail(error)
-    outputs = Outputs(
+    run_and_report(benchmark, _reproduced(task, place))
+
+
+def _reproduced(task: str, folder: Path) -> Outputs:
+    from lagros_benchmarks.report import Outputs
+
+    return Outputs(
         json=folder / "results.json",
         latex=folder / "table.tex",
-        figure=folder / "error.png",
+        figure=folder / ("error.png" if task == "cartpole" else "sweep.png"),
+        scene=folder / "scene.png" if task == "spacecraft" else None,
     )
-    run_and_report(benchmark, outputs)
+
+
+app.command()(watch)
 
 
 def progress_line(line: str) -> None:
@@ -256,6 +280,7 @@ def run_and_report(settings: BenchmarkSettings, outputs: Outputs) -> list[Row]:
     """
     from lagros_benchmarks.library import SetupError
     from lagros_benchmarks.records import summarise
+    from lagros_benchmarks.report import print_report
     from lagros_benchmarks.runner import run_benchmark
 
     try:
@@ -265,28 +290,10 @@ def run_and_report(settings: BenchmarkSettings, outputs: Outputs) -> list[Row]:
         # No weights, damaged weights, an extra that is not installed.
         fail(error, status=1)
     rows = summarise(run)
-    report(rows)
+    print_report(rows)
     for path in outputs.write(run, rows):
         typer.echo(f"wrote {path}")
     return rows
-
-
-def report(rows: list[Row]) -> None:
-    """Print the tables, the paired differences and what raised."""
-    from rich.console import Console
-    from rich.text import Text
-
-    from lagros_benchmarks import tables
-
-    console = Console(highlight=False)
-    for group in tables.by_condition(rows):
-        console.print(tables.terminal_table(group))
-        for line in tables.comparison_lines(group):
-            console.print(line)
-        console.print()
-    for line in (tables.LEGEND, *tables.error_lines(rows)):
-        # As text: the message of an exception may hold what rich takes for markup.
-        console.print(Text(line))
 
 
 @contextmanager

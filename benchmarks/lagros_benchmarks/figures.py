@@ -1,78 +1,46 @@
-"""Figures of a benchmark, drawn from its rows alone (so a saved JSON can be drawn again).
-
-The colours are Okabe and Ito's, which colour-blind readers can tell apart; line styles and direct
-labels tell the policies apart in greyscale.
-"""
+"""Figures of a benchmark, drawn from its rows alone (so a saved JSON can be drawn again)."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lagros_benchmarks.files import write_atomic
-from lagros_benchmarks.records import Row
-from lagros_benchmarks.tables import by_condition, condition_title, policy_label
+from lagros_benchmarks import spacecraft_figures
+from lagros_benchmarks.canvas import (
+    BLACK,
+    LONGEST_LABEL,
+    FloatArray,
+    canvas,
+    caption,
+    check_figure_path,
+    curve,
+    save,
+    styles,
+)
+from lagros_benchmarks.experiment import Row
+from lagros_benchmarks.formats import by_condition, condition_title, policy_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-FloatArray = NDArray[np.float64]
-
-FORMATS = (".png", ".pdf", ".svg")
-_DOTS_PER_INCH = 150
-_BLACK = "#000000"
-_LONGEST_LABEL = 24
-
-
-class _Style(NamedTuple):
-    colour: str
-    line: Any
-    marker: str
-
-
-_STYLES = {
-    "learned": _Style("#E69F00", (0, (5, 1.5, 1, 1.5)), "s"),
-    "tube-mpc": _Style("#0072B2", (0, (5, 2)), "o"),
-    "lagros": _Style("#D55E00", "solid", "D"),
-    "lqr": _Style("#009E73", (0, (1, 1.2)), "^"),
-    "ppo": _Style("#CC79A7", (0, (8, 2, 1, 2, 1, 2)), "v"),
-    "random": _Style("#999999", (0, (2, 3)), "x"),
-}
-_OTHERS = (
-    _Style("#56B4E9", (0, (6, 1)), "P"),
-    _Style("#B8860B", (0, (3, 1, 1, 1)), "X"),
-    _Style("#000000", (0, (4, 4)), "*"),
-    _Style("#882255", (0, (1, 3)), "<"),
-    _Style("#44AA99", (0, (9, 3)), ">"),
-)
-
-
-def styles(policies: Sequence[str]) -> dict[str, _Style]:
-    """Return a style for each policy; a known name always looks the same."""
-    strangers = [name for name in policies if name not in _STYLES]
-    found = {name: _OTHERS[index % len(_OTHERS)] for index, name in enumerate(strangers)}
-    return {name: _STYLES[name] if name in _STYLES else found[name] for name in policies}
-
-
-def check_figure_path(path: str | Path) -> Path:
-    """Return the path of a figure.
-
-    Raises:
-        ValueError: Its suffix names no format that can be drawn.
-    """
-    if Path(path).suffix.lower() not in FORMATS:
-        raise ValueError(f"figure {str(path)!r} must end in {', '.join(FORMATS)}")
-    return Path(path)
+__all__ = ["check_figure_path", "draw", "error_figure", "grid_figure", "styles"]
 
 
 def draw(rows: Sequence[Row], path: str | Path) -> Path:
-    """Draw the error figure of one condition, or the success figure of several."""
+    """Draw what is apt: for the cart-pole error or success, for the spacecraft success and effort.
+
+    Args:
+        rows: Rows of any conditions of one task.
+        path: The figure, .png, .pdf or .svg.
+
+    Returns:
+        The path.
+    """
+    if rows[0]["task"] == "spacecraft":
+        return spacecraft_figures.draw(rows, path)
     return (error_figure if len(by_condition(rows)) == 1 else grid_figure)(rows, path)
 
 
@@ -98,10 +66,10 @@ def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
     drawn = [row for row in rows if row["mean_tracking_error"] is not None]
     if not drawn:
         raise ValueError("no row has a tracking error: every nominal plan failed")
-    figure, (axes,) = _canvas(7.0, 4.2)
-    times = _curve(rows[0]["time_s"])
-    tube = _curve(rows[0]["paper_tube"])
-    means = {row["policy"]: _curve(row["mean_tracking_error"]) for row in drawn}
+    figure, (axes,) = canvas(7.0, 4.2)
+    times = curve(rows[0]["time_s"])
+    tube = curve(rows[0]["paper_tube"])
+    means = {row["policy"]: curve(row["mean_tracking_error"]) for row in drawn}
     top = max(float(np.nanmax(mean)) for mean in means.values())
     logarithmic = top > 3.0 * float(tube[-1])
     floor = 0.0
@@ -112,22 +80,22 @@ def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
     labels: list[tuple[float, str, str]] = []
     for name, style in styles([row["policy"] for row in drawn]).items():
         row = next(row for row in drawn if row["policy"] == name)
-        low, high = _curve(row["tracking_error_p10"]), _curve(row["tracking_error_p90"])
+        low, high = curve(row["tracking_error_p10"]), curve(row["tracking_error_p90"])
         axes.fill_between(times, low, high, color=style.colour, alpha=0.15, linewidth=0)
         axes.plot(times, means[name], color=style.colour, linestyle=style.line, linewidth=2)
         last = means[name][np.isfinite(means[name])][-1]
-        labels.append((float(last), policy_label(name, _LONGEST_LABEL), style.colour))
-    axes.plot(times, tube, color=_BLACK, linewidth=1.5)
-    labels.append((float(tube[-1]), "paper tube r(t)", _BLACK))
+        labels.append((float(last), policy_label(name, LONGEST_LABEL), style.colour))
+    axes.plot(times, tube, color=BLACK, linewidth=1.5)
+    labels.append((float(tube[-1]), "paper tube r(t)", BLACK))
     note = _draw_certified(axes, rows[0], times, ceiling, labels)
     axes.set(xlim=(times[0], times[-1]), ylim=(max(floor, 1e-3) if logarithmic else 0.0, ceiling))
     axes.set(xlabel="time t [s]", ylabel="tracking error $\\|x - x_d\\|$  [m, rad, m/s, rad/s]")
     episodes = rows[0]["episodes"]
     axes.set_title(f"{condition_title(rows[0])}, {episodes} episodes", loc="left", fontsize=10)
-    caption = "lines: mean; bands: 10th to 90th percentile; a fall keeps its largest error"
-    _caption(figure, caption + note)
+    text = "lines: mean; bands: 10th to 90th percentile; a fall keeps its largest error"
+    caption(figure, text + note)
     _label_ends(axes, labels)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
@@ -145,7 +113,7 @@ def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
     policies = list(dict.fromkeys(row["policy"] for row in rows))
     columns = min(len(kinds), 3)
     lines = -(-len(kinds) // columns)
-    figure, panels = _canvas(max(2.6 * columns, 4.5), 2.3 * lines + 0.9, lines, columns)
+    figure, panels = canvas(max(2.6 * columns, 4.5), 2.3 * lines + 0.9, lines, columns)
     bounds = sorted({row["bound"] for row in rows})
     # Policies of equal success would hide each other: each is moved by a little.
     step = 0.012 * (max(bounds) - min(bounds) or 1.0)
@@ -153,11 +121,9 @@ def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
         for index, (name, style) in enumerate(styles(policies).items()):
             own = [row for row in rows if row["disturbance"] == kind and row["policy"] == name]
             own.sort(key=lambda row: float(row["bound"]))
-            rates = 100 * _curve([row["success_rate"] for row in own])
+            rates = 100 * curve([row["success_rate"] for row in own])
             ends = 100 * np.array([row["success_ci95"] for row in own]).reshape(-1, 2)
-            places = _curve([row["bound"] for row in own]) + step * (
-                index - (len(policies) - 1) / 2
-            )
+            places = curve([row["bound"] for row in own]) + step * (index - (len(policies) - 1) / 2)
             axes.errorbar(
                 places,
                 rates,
@@ -169,7 +135,7 @@ def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
                 capsize=2,
                 linewidth=1.6,
                 elinewidth=1,
-                label=policy_label(name, _LONGEST_LABEL),
+                label=policy_label(name, LONGEST_LABEL),
             )
         axes.set_title(kind, loc="left", fontsize=10)
         axes.set(ylim=(-4, 104), yticks=(0, 25, 50, 75, 100))
@@ -190,30 +156,7 @@ def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
         frameon=False,
         handlelength=3.5,
     )
-    return _save(figure, path)
-
-
-def _canvas(
-    width: float, height: float, lines: int = 1, columns: int = 1
-) -> tuple[Figure, list[Axes]]:
-    # No pyplot: it keeps global state and picks a window system.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=_DOTS_PER_INCH, layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
-    panels: list[Axes] = list(grid.flat)
-    for axes in panels:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="y", color="#DDDDDD", linewidth=0.6)
-        axes.set_axisbelow(True)
-    return figure, panels
-
-
-def _curve(values: Any) -> FloatArray:
-    # A row that went through JSON has null where a number was not finite.
-    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+    return save(figure, path)
 
 
 def _draw_certified(
@@ -226,16 +169,12 @@ def _draw_certified(
     """Draw the certified tube if it fits, else return a note of its size."""
     if row["certified_tube"] is None:
         return ""
-    tube = _curve(row["certified_tube"])
+    tube = curve(row["certified_tube"])
     if tube[-1] > ceiling:
         return f"\nnot shown: our certified tube, which grows to {tube[-1]:.3g}"
-    axes.plot(times, tube, color=_BLACK, linewidth=1, linestyle=(0, (4, 2)))
-    labels.append((float(tube[-1]), "certified tube", _BLACK))
+    axes.plot(times, tube, color=BLACK, linewidth=1, linestyle=(0, (4, 2)))
+    labels.append((float(tube[-1]), "certified tube", BLACK))
     return ""
-
-
-def _caption(figure: Figure, text: str) -> None:
-    figure.supxlabel(text, fontsize=8, color="#444444", x=0.01, ha="left")
 
 
 def _label_ends(axes: Axes, labels: list[tuple[float, str, str]]) -> None:
@@ -262,9 +201,3 @@ def _label_ends(axes: Axes, labels: list[tuple[float, str, str]]) -> None:
             fontsize=9,
             va="center",
         )
-
-
-def _save(figure: Figure, path: Path) -> Path:
-    stream = io.BytesIO()
-    figure.savefig(stream, format=path.suffix.lower()[1:])
-    return write_atomic(path, stream.getvalue())

@@ -26,7 +26,9 @@ class Policy(Protocol):
     """What an episode needs of a policy: `predict` of stable-baselines3's protocol.
 
     A policy may also have `counters(state) -> dict[str, int]`, `reseed(generator)` for what it
-    draws itself and, to time its network alone, `bare_forward` and `example_features()`.
+    draws itself and, to time its network alone, `bare_forward` and `example_features()`. One of the
+    spacecraft says by `observes` whether it is fed the rows of all agents ("local") or `state()` of
+    all worlds ("global").
     """
 
     def predict(
@@ -67,12 +69,45 @@ class Planner(Protocol):
         ...
 
 
-def make_policy(name: str, env: Environment, settings: Mapping[str, Any]) -> Policy:
+def make_policy(name: str, env: Any, settings: Mapping[str, Any]) -> Policy:
     """Build a policy from its name or file."""
     import lagros_policies
 
     policy: Policy = lagros_policies.make(name, env, **settings)
     return policy
+
+
+def make_filter(policy: Any, env: Any, disturbance_bound: float) -> Policy:
+    """Return a policy of the spacecraft that wears the safety filter.
+
+    Args:
+        policy: The policy.
+        env: A spacecraft environment; its task and preset are taken.
+        disturbance_bound: d_bar, in units of the state per second.
+    """
+    from lagros_policies.safety import SafetyFilter
+
+    filtered: Policy = SafetyFilter(
+        policy, env.settings, env.preset, disturbance_bound=disturbance_bound
+    )
+    return filtered
+
+
+def position_margin(policy: Policy, disturbance_bound: float) -> float | None:
+    """Return the certified bound of the position error to x_d [m], of a policy that tracks with u*.
+
+    Args:
+        policy: The policy; None is returned unless it is the centralised one, whose tracking law is
+            the one that the bound holds for.
+        disturbance_bound: d_bar, in units of the state per second.
+    """
+    from lagros_policies.contraction.double_integrator import certified_margin
+    from lagros_policies.contraction.wrench_control import WrenchTracking
+
+    tracking = getattr(policy, "tracking", None)
+    if not isinstance(tracking, WrenchTracking):
+        return None
+    return certified_margin(tracking.plane, disturbance_bound)
 
 
 def make_planner() -> Planner:
@@ -121,11 +156,15 @@ class Toolbox:
         make_planner: The planner of the nominal trajectories.
         load_metric: File or None to M(x).
         certified_radius: Metric file, bound and times to radii, or None without certificate.
+        make_filter: Policy, spacecraft environment and bound to the policy with the safety filter.
+        position_margin: Policy and bound to the certified bound of its position error, or None.
     """
 
-    make_policy: Callable[[str, Environment, Mapping[str, Any]], Policy] = make_policy
+    make_policy: Callable[[str, Any, Mapping[str, Any]], Policy] = make_policy
     make_planner: Callable[[], Planner] = make_planner
     load_metric: Callable[[str | None], Callable[[FloatArray], FloatArray]] = load_metric
     certified_radius: Callable[[str | None, float, FloatArray], FloatArray | None] = (
         certified_radius
     )
+    make_filter: Callable[[Policy, Any, float], Policy] = make_filter
+    position_margin: Callable[[Policy, float], float | None] = position_margin

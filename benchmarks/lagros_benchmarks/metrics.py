@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -159,6 +160,68 @@ def _bootstrap(data: tuple[FloatArray, ...], statistic: Any) -> Interval:
         rng=np.random.default_rng(_BOOTSTRAP_SEED),
     ).confidence_interval
     return Interval(float(result.low), float(result.high))
+
+
+def cluster_interval(
+    numerators: Sequence[float] | FloatArray, denominators: Sequence[float] | FloatArray
+) -> Interval | None:
+    """Return the percentile bootstrap interval, over clusters, of the ratio of two sums.
+
+    Whole clusters are resampled, so that what happens to the agents of one world may depend on each
+    other as it likes. A rate is successes over agents, a mean is totals over counts, a ratio of
+    means is totals over totals.
+
+    Args:
+        numerators: One per cluster.
+        denominators: One per cluster, none negative; a cluster with zero has nothing to say and is
+            left out.
+
+    Returns:
+        The interval, or None for fewer than two clusters, or if a number is not finite.
+    """
+    above = np.asarray(numerators, dtype=np.float64)
+    below = np.asarray(denominators, dtype=np.float64)
+    above, below = above[below != 0.0], below[below != 0.0]
+    if above.size < 2 or not (np.all(np.isfinite(above)) and np.all(np.isfinite(below))):
+        return None
+    weights = _resampled(above.size)
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    low, high = np.percentile((weights @ above) / (weights @ below), [tail, 100.0 - tail])
+    return Interval(float(low), float(high))
+
+
+def cluster_rate_interval(successes: Sequence[int], trials: Sequence[int]) -> Interval:
+    """Return an interval of a rate whose trials come in clusters: agents in worlds.
+
+    Where all trials agree, resampling has no spread; the interval is then Wilson's with the
+    clusters as trials, which is right however much the trials of a cluster depend on each other.
+
+    Args:
+        successes: One count per cluster.
+        trials: One count per cluster.
+
+    Raises:
+        ValueError: There are no trials, or more successes than trials.
+    """
+    total, most = int(np.sum(successes)), int(np.sum(trials))
+    over_trials = wilson_interval(total, most)
+    interval = None
+    if 0 < total < most:
+        interval = cluster_interval(np.asarray(successes), np.asarray(trials))
+    if interval is not None:
+        return interval
+    if total not in (0, most):
+        return over_trials  # one cluster: there is nothing to resample
+    clusters = int(np.count_nonzero(trials))
+    return wilson_interval(clusters if total else 0, clusters)
+
+
+@lru_cache(maxsize=8)
+def _resampled(clusters: int) -> FloatArray:
+    """Return how often each resample holds each cluster, shape (resamples, clusters)."""
+    generator = np.random.default_rng(_BOOTSTRAP_SEED)
+    shares = np.full(clusters, 1.0 / clusters)
+    return generator.multinomial(clusters, shares, RESAMPLES).astype(np.float64)
 
 
 class StepTimes(NamedTuple):

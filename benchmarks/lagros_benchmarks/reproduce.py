@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -25,6 +25,7 @@ from lagros_policies.contraction import Metric, load_metric, save_metric
 from lagros_policies.imitation.dataset import ExpertData, ExpertDataSettings, generate
 from lagros_policies.imitation.features import FEATURES, cartpole_features
 from lagros_policies.imitation.networks import Mlp
+from lagros_policies.imitation.shards import claim
 from lagros_policies.imitation.train import TrainingSettings, fit, learning_error
 from lagros_policies.metric_design import MetricDesignSettings, design_cartpole_metric
 
@@ -54,6 +55,20 @@ class ReproduceSettings:
     bound: float = 0.75
     seed: int = 0
     jobs: int = 2
+
+    @property
+    def shipped_benchmark(self) -> BenchmarkSettings:
+        """Return the benchmark of the shipped metric and weights."""
+        return BenchmarkSettings(
+            policies=_POLICIES,
+            episodes=self.episodes,
+            bounds=(self.bound,),
+            seed=self.seed,
+            jobs=self.jobs,
+        )
+
+
+_POLICIES = ("learned", "tube-mpc", "lagros", "lqr")
 
 
 def reproduce_cartpole(
@@ -103,18 +118,14 @@ def reproduce_cartpole(
     }
     for name, (training, observation, control, plan) in targets.items():
         _network(folder, name, training, observation, control, plan, update, note)
-    return BenchmarkSettings(
-        policies=("learned", "tube-mpc", "lagros", "lqr"),
-        episodes=settings.episodes,
-        bounds=(settings.bound,),
-        seed=settings.seed,
+    return replace(
+        settings.shipped_benchmark,
         metric=str(folder / "metric.json"),
         policy_settings={
             "learned": {"weights": str(folder / "cartpole_learned.safetensors")},
             "tube-mpc": {"metric": str(folder / "metric.json")},
             "lagros": {"weights": str(folder / "cartpole_lagros.safetensors")},
         },
-        jobs=settings.jobs,
     )
 
 
@@ -200,10 +211,5 @@ def _claim(folder: Path, settings: ReproduceSettings) -> None:
     record = asdict(settings)
     for free in ("jobs", "episodes", "seed", "bound"):
         del record[free]
-    record = json.loads(json.dumps(record))
-    path = folder / "settings.json"
-    if path.exists() and json.loads(path.read_text()) != record:
-        raise ValueError(
-            f"{folder} holds a run of other settings; name another folder or remove it"
-        )
-    write_atomic(path, json.dumps(record, indent=1) + "\n")
+    folder.mkdir(parents=True, exist_ok=True)
+    claim(folder / "settings.json", record, "a run")

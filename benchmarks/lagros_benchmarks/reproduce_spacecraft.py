@@ -173,7 +173,6 @@ class _Stage:
         """Fit one network, unless its file is there, and write its record beside it."""
         weights = _weights(self.folder, name)
         begun = perf_counter()
-        record: dict[str, Any] = {}
         if not weights.exists():
             samples = join([self._samples(part) for part in parts])
             network = fit_deep_set(
@@ -184,17 +183,17 @@ class _Stage:
             )
             network.metadata.update(policy=name, task="spacecraft")
             network.save(weights)
-            record = {
-                "policy": name,
-                "command": "lagros reproduce spacecraft",
-                "training": asdict(training),
-                "samples": len(samples),
-                "weights": network.weights,
-            }
-        error = _learning_error(DeepSet.load(weights), self._samples(test))
-        if record:
-            record["learning_error"] = error
-            write_atomic(weights.with_suffix(".json"), json.dumps(record, indent=1) + "\n")
+        fitted = DeepSet.load(weights)
+        error = _learning_error(fitted, self._samples(test))
+        record = {
+            "policy": name,
+            "command": "lagros reproduce spacecraft",
+            "training": asdict(training),
+            "samples": sum(len(part.observation) for part in parts),
+            "weights": fitted.weights,
+            "learning_error": error,
+        }
+        write_atomic(weights.with_suffix(".json"), json.dumps(record, indent=1) + "\n")
         self.say(
             f"{name} ({perf_counter() - begun:.0f} s): error of the acceleration, mean "
             f"{error['mean']:.3g}, p99 {error['p99']:.3g} m/s² on {error['samples']} samples"

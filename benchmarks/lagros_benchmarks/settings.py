@@ -13,10 +13,28 @@ from typing import Any, NamedTuple
 from lagros_envs.disturbances import KINDS
 from lagros_envs.seeding import EVALUATION, episode_seeds
 
-TASKS = ("cartpole",)
-PLANNED_TASKS = ("spacecraft",)
+TASKS = ("cartpole", "spacecraft")
 CHANNELS = ("all", "rates")
+# Whether policies fly without a safety filter, with it, or both one after the other.
+SAFETY_FILTERS: dict[str, tuple[bool, ...]] = {
+    "none": (False,),
+    "all": (True,),
+    "both": (False, True),
+}
 DEFAULT_POLICIES = ("learned", "tube-mpc", "lagros", "lqr")
+# What a task wants in place of the defaults of `BenchmarkSettings`.
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "cartpole": {},
+    "spacecraft": {
+        "policies": ("learned", "tube-mpc", "lagros", "centralized"),
+        "bounds": (0.2, 0.4, 0.6, 0.8, 1.0),
+        "preset": "paper",
+        "agents": (6,),
+        "safety_filter": "both",
+    },
+}
+# Bound of a comparison of numbers of agents, which has no use for a sweep over bounds.
+SCALE_BOUNDS = (0.4,)
 
 
 class Condition(NamedTuple):
@@ -31,6 +49,22 @@ class Condition(NamedTuple):
     bound: float
 
 
+class Case(NamedTuple):
+    """One policy under one condition.
+
+    Attributes:
+        policy: Policy, as the run was asked for it.
+        condition: The disturbance.
+        safety_filter: Whether it wears the safety filter.
+        agents: Agents of each world; None for the cart-pole.
+    """
+
+    policy: str
+    condition: Condition
+    safety_filter: bool = False
+    agents: int | None = None
+
+
 def unknown_name(what: str, given: str, valid: Iterable[str], note: str = "") -> str:
     """Return the message for a name that is not known: a close match, then all valid names."""
     names = list(valid)
@@ -39,15 +73,19 @@ def unknown_name(what: str, given: str, valid: Iterable[str], note: str = "") ->
     return f"unknown {what} {given!r}.{hint} Valid: {', '.join(names)}{note}."
 
 
-def check_policy(name: str) -> None:
+def check_policy(name: str, task: str = "cartpole") -> None:
     """Check that a policy is a known name, an existing file or an importable module.
+
+    Args:
+        name: The policy.
+        task: The task whose names count.
 
     Raises:
         ValueError: It is neither.
     """
-    import lagros_policies
+    from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
 
-    names = tuple(lagros_policies.NAMES)
+    names = NAMES if task == "cartpole" else SPACECRAFT_NAMES
     if name in names:
         return
     # A file may be written algorithm:file, as in sac:model.zip.
@@ -72,10 +110,8 @@ def check_task(task: str) -> None:
     """Check the name of a task.
 
     Raises:
-        ValueError: The task is unknown or not there yet.
+        ValueError: The task is unknown.
     """
-    if task in PLANNED_TASKS:
-        raise ValueError(f"task {task!r} is not there yet. Valid: {', '.join(TASKS)}.")
     if task not in TASKS:
         raise ValueError(unknown_name("task", task, TASKS))
 
@@ -87,7 +123,7 @@ class BenchmarkSettings:
     Attributes:
         task: Name of the task.
         policies: Names of `lagros_policies.NAMES`, or files of stable-baselines3 models.
-        episodes: Episodes of each policy under each condition.
+        episodes: Episodes of each policy under each condition; worlds, with agents.
         seed: Seed of the run. Its episodes belong to the namespace `EVALUATION` of
             `lagros_envs.seeding`, so they are never those of a training run, of whatever seed.
         disturbances: Kinds of disturbance.
@@ -95,11 +131,15 @@ class BenchmarkSettings:
         channels: Disturbed states, "all" or "rates".
         metric: File of the contraction metric for the kind "worst" and for the certified tube;
             None takes the shipped one.
+        preset: Preset of the spacecraft's scenarios; None for the cart-pole, as the next two.
+        agents: Numbers of spacecraft in a world; several compare them.
+        safety_filter: "none", "all" policies wear the filter, or "both" one after the other.
         policy_settings: Further settings of `lagros_policies.make`, by policy.
         jobs: Worker processes.
-        chunk: Episodes that a worker takes at a time.
-        timing_episodes: With more than one job the workers contend for the processor, so the
-            published step times come from a serial pass over this many first episodes.
+        chunk: Episodes that a worker takes at a time; worlds that fly in one batch.
+        timing_episodes: The published step times come from a serial pass over this many first
+            episodes: with more than one job the workers contend for the processor, and the
+            spacecraft fly in batches.
 
     Raises:
         ValueError: A setting is not valid.
@@ -113,6 +153,9 @@ class BenchmarkSettings:
     bounds: tuple[float, ...] = (0.75,)
     channels: str = "all"
     metric: str | None = None
+    preset: str | None = None
+    agents: tuple[int, ...] = ()
+    safety_filter: str = "none"
     policy_settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     jobs: int = 1
     chunk: int = 25
@@ -121,9 +164,9 @@ class BenchmarkSettings:
     def __post_init__(self) -> None:
         """Check the settings."""
         check_task(self.task)
-        for name in ("policies", "disturbances", "bounds"):
+        for name in ("policies", "disturbances", "bounds", "agents"):
             values = getattr(self, name)
-            if not values:
+            if not values and not (name == "agents" and self.task == "cartpole"):
                 raise ValueError(f"{name} must not be empty")
             if len(set(values)) != len(values):
                 raise ValueError(f"{name}={','.join(map(str, values))} names one of them twice")
@@ -140,9 +183,67 @@ class BenchmarkSettings:
                 raise ValueError(f"{name}={getattr(self, name)!r} must be at least 1")
         if self.seed < 0:
             raise ValueError(f"seed={self.seed!r} must be a non-negative integer")
+        if self.task == "cartpole":
+            self._check_alone()
+        else:
+            self._check_spacecraft()
         strangers = set(self.policy_settings) - set(self.policies)
         if strangers:
             raise ValueError(f"policy_settings names {sorted(strangers)}, which do not run")
+
+    def _check_alone(self) -> None:
+        for name, none in (("preset", None), ("agents", ()), ("safety_filter", "none")):
+            if getattr(self, name) != none:
+                raise ValueError(
+                    f"{name}={getattr(self, name)!r} is for the task spacecraft; leave it out for "
+                    "cartpole"
+                )
+
+    def _check_spacecraft(self) -> None:
+        from lagros_envs.scenarios import PRESETS
+
+        if self.preset not in PRESETS:
+            raise ValueError(unknown_name("preset", str(self.preset), PRESETS))
+        if self.safety_filter not in SAFETY_FILTERS:
+            raise ValueError(unknown_name("safety filter", self.safety_filter, SAFETY_FILTERS))
+        for count in self.agents:
+            if count < 1:
+                raise ValueError(f"agents={count!r} must be at least 1")
+        if "worst" in self.disturbances:
+            raise ValueError(
+                "disturbance 'worst' pushes away from one nominal trajectory that all policies "
+                "share, which the spacecraft's do not: each makes its own way. Valid: "
+                f"{', '.join(kind for kind in KINDS if kind != 'worst')}."
+            )
+
+    @classmethod
+    def for_task(cls, task: str, **given: Any) -> BenchmarkSettings:
+        """Return the settings of a task, with its own defaults for what is None.
+
+        Args:
+            task: Name of the task.
+            given: Settings; None takes the task's default.
+
+        Raises:
+            ValueError: A setting is not valid.
+        """
+        check_task(task)
+        chosen = {name: value for name, value in given.items() if value is not None}
+        defaults = DEFAULTS[task]
+        if len(chosen.get("agents", ())) > 1:
+            defaults = defaults | {"bounds": SCALE_BOUNDS}
+        return cls(task=task, **(defaults | chosen))
+
+    @property
+    def cases(self) -> tuple[Case, ...]:
+        """All that is run, in the order of the rows."""
+        return tuple(
+            Case(policy, condition, filtered, count)
+            for count in self.agents or (None,)
+            for condition in self.conditions
+            for filtered in SAFETY_FILTERS[self.safety_filter]
+            for policy in self.policies
+        )
 
     @property
     def conditions(self) -> tuple[Condition, ...]:

@@ -11,86 +11,38 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import os
 import platform
 import sys
-import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-import stable_baselines3
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 from lagros_benchmarks.files import write_json
+from lagros_benchmarks.ppo_run import (
+    CURVE_SEED,
+    PpoTraining,
+    actor_network,
+    agent,
+    rounded,
+    run_segments,
+    versions,
+)
 from lagros_benchmarks.sb3_vector import LinearFeatures, SB3VectorEnv
 from lagros_envs import cartpole_task as task
 from lagros_envs.cartpole_vector import CartPoleVectorEnv
 from lagros_envs.seeding import episode_seeds
 from lagros_policies.baselines import PRETRAINED_PPO, PpoActor, PpoPolicy, goal_frame
-from lagros_policies.imitation.networks import Mlp
 
 _LOG = logging.getLogger(__name__)
-# Seeds of the held-out episodes of the curve, and of the larger set at the end. They are not those
-# of `lagros bench`, which have a namespace of their own.
-_CURVE_SEED, _FINAL_SEED = 910_001, 910_002
-
-
-@dataclass(frozen=True)
-class PpoTraining:
-    """Everything that a training run depends on, besides the task's physics.
-
-    Attributes:
-        seed: Seed of the run.
-        segments: Number of segments: the budget is the product of the next three with it.
-        rollouts: Rollouts, each followed by an update, in a segment.
-        rollout_steps: Control steps of a rollout in every world.
-        worlds: Worlds side by side.
-        batch_size: Samples of one gradient step.
-        epochs: Passes over a rollout.
-        learning_rate: At the start; it falls linearly, by segments, to a tenth.
-        discount: gamma per control step.
-        gae_decay: lambda of the generalised advantage estimate.
-        clip_range: Clip of the probability ratio.
-        initial_log_std: Logarithm of the spread of the first actions. -2 is 5.4 N: the usual 0
-            explores with 40 N, which makes every action costly and the pole fall at once.
-        hidden: Widths of the hidden tanh layers, of actor and critic each.
-        effort_weight: Replaces that of `CartPoleSettings` in training, where 0.01 makes for an
-            agent that balances at twice the effort.
-        disturbance: Kind of disturbance in training.
-        disturbance_bound: Its bound d_bar.
-        curve_episodes: Held-out episodes after every segment.
-        final_episodes: Held-out episodes at the end, others than those of the curve.
-    """
-
-    seed: int = 0
-    segments: int = 40
-    rollouts: int = 20
-    rollout_steps: int = 90
-    worlds: int = 64
-    batch_size: int = 1440
-    epochs: int = 10
-    learning_rate: float = 3e-4
-    discount: float = 0.99
-    gae_decay: float = 0.95
-    clip_range: float = 0.2
-    initial_log_std: float = -2.0
-    hidden: tuple[int, ...] = (64, 64)
-    effort_weight: float = 0.1
-    disturbance: str = "uniform"
-    disturbance_bound: float = 0.75
-    curve_episodes: int = 500
-    final_episodes: int = 2000
-
-    @property
-    def segment_steps(self) -> int:
-        """Control steps of a segment, over all worlds."""
-        return self.rollouts * self.rollout_steps * self.worlds
+# Seed of the held-out episodes at the end: neither those of the curve nor those of `lagros bench`.
+_FINAL_SEED = 910_002
 
 
 def build(training: PpoTraining) -> tuple[PPO, VecNormalize]:
@@ -105,25 +57,7 @@ def build(training: PpoTraining) -> tuple[PPO, VecNormalize]:
     )
     features = LinearFeatures(SB3VectorEnv(venv), goal_frame())
     normalised = VecNormalize(features, gamma=training.discount)
-    model = PPO(
-        "MlpPolicy",
-        normalised,
-        n_steps=training.rollout_steps,
-        batch_size=training.batch_size,
-        n_epochs=training.epochs,
-        learning_rate=training.learning_rate,
-        gamma=training.discount,
-        gae_lambda=training.gae_decay,
-        clip_range=training.clip_range,
-        policy_kwargs={
-            "net_arch": list(training.hidden),
-            "activation_fn": torch.nn.Tanh,
-            "log_std_init": training.initial_log_std,
-        },
-        seed=training.seed,
-        device="cpu",
-    )
-    return model, normalised
+    return agent(training, normalised), normalised
 
 
 def extract_actor(
@@ -143,22 +77,10 @@ def extract_actor(
     Raises:
         ValueError: The policy is not such a network.
     """
-    policy: Any = model.policy
-    hidden = list(policy.mlp_extractor.policy_net)
-    linear, other = hidden[::2], hidden[1::2]
-    plain = (
-        not list(policy.features_extractor.parameters())
-        and all(isinstance(layer, torch.nn.Linear) for layer in linear)
-        and all(isinstance(layer, torch.nn.Tanh) for layer in other)
-    )
-    if not plain:
-        raise ValueError(f"only a plain network of tanh layers can be exported, not {policy}")
-    if model.use_sde or policy.squash_output:
-        raise ValueError("an agent with state-dependent exploration cannot be exported")
+    network = actor_network(model)
     space = model.action_space
     if not isinstance(space, gymnasium.spaces.Box) or not np.array_equal(space.low, -space.high):
         raise ValueError(f"the action space {space} is not a symmetric Box")
-    layers = [*linear, policy.action_net]
     features = _features(model, normalised)
     count = features.shape[0]
     mean, std, clip = np.zeros(count), np.ones(count), float(np.finfo(np.float32).max)
@@ -167,10 +89,7 @@ def extract_actor(
         mean, std = statistics.mean, np.sqrt(statistics.var + normalised.epsilon)
         clip = float(normalised.clip_obs)
     return PpoActor(
-        network=Mlp(
-            [layer.weight.detach().numpy().T for layer in layers],
-            [layer.bias.detach().numpy() for layer in layers],
-        ),
+        network=network,
         features=features.astype(np.float32),
         mean=mean.astype(np.float32),
         std=std.astype(np.float32),
@@ -277,27 +196,19 @@ def train(training: PpoTraining, out: Path | str, checkpoint: Path | str) -> Ppo
         ValueError: The checkpoint is damaged or belongs to another run.
     """
     model, normalised = build(training)
-    curve: list[dict[str, float]] = []
-    if Path(checkpoint).exists():
-        curve = _restore(Path(checkpoint), training, model, normalised)
-        _LOG.info("going on after segment %d of %d", len(curve), training.segments)
-    for segment in range(len(curve), training.segments):
-        begun = time.perf_counter()
-        _learn_segment(model, normalised, training, segment)
-        figures = evaluate(
+
+    def figures() -> dict[str, float]:
+        return evaluate(
             PpoPolicy(weights=extract_actor(model, normalised)),
             training.curve_episodes,
-            _CURVE_SEED,
+            CURVE_SEED,
             training.disturbance,
             training.disturbance_bound,
         )
-        seconds = time.perf_counter() - begun + (curve[-1]["seconds"] if curve else 0.0)
-        steps = (segment + 1) * training.segment_steps
-        curve.append({"steps": steps, "seconds": round(seconds, 1), **_rounded(figures)})
-        _save(Path(checkpoint), training, model, normalised, curve)
-        _LOG.info("%s", json.dumps(curve[-1]))
+
+    curve = run_segments(training, model, normalised, Path(checkpoint), figures)
     final = {
-        f"{kind} {bound:g}": _rounded(
+        f"{kind} {bound:g}": rounded(
             evaluate(
                 PpoPolicy(weights=extract_actor(model, normalised)),
                 training.final_episodes,
@@ -310,80 +221,6 @@ def train(training: PpoTraining, out: Path | str, checkpoint: Path | str) -> Ppo
     }
     _LOG.info("final, %d episodes: %s", training.final_episodes, json.dumps(final))
     return export_actor(model, normalised, out, _record(training, curve, final))
-
-
-def _learn_segment(
-    model: PPO, normalised: VecNormalize, training: PpoTraining, segment: int
-) -> None:
-    # Fresh episodes and fresh streams: nothing but the checkpoint is carried over.
-    words = np.random.SeedSequence(training.seed, spawn_key=(segment,)).generate_state(1)
-    model.set_env(normalised, force_reset=True)
-    model.set_random_seed(int(words[0]))
-    rate = training.learning_rate * (1.0 - 0.9 * segment / training.segments)
-    model.lr_schedule = lambda _: rate
-    model.learn(training.segment_steps, reset_num_timesteps=False)
-
-
-def _statistics(normalised: VecNormalize) -> dict[str, Any]:
-    return {"features": normalised.obs_rms, "returns": normalised.ret_rms}
-
-
-def _state(training: PpoTraining) -> str:
-    return json.dumps(asdict(training), sort_keys=True)
-
-
-def _save(
-    path: Path,
-    training: PpoTraining,
-    model: PPO,
-    normalised: VecNormalize,
-    curve: list[dict[str, float]],
-) -> None:
-    statistics = {
-        name: [torch.as_tensor(np.float64(value)) for value in (rms.mean, rms.var, rms.count)]
-        for name, rms in _statistics(normalised).items()
-    }
-    content = {
-        "training": _state(training),
-        "policy": model.policy.state_dict(),
-        "optimizer": model.policy.optimizer.state_dict(),
-        "statistics": statistics,
-        "timesteps": model.num_timesteps,
-        "updates": model._n_updates,
-        "curve": curve,
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    torch.save(content, temporary)
-    os.replace(temporary, path)
-
-
-def _restore(
-    path: Path, training: PpoTraining, model: PPO, normalised: VecNormalize
-) -> list[dict[str, float]]:
-    try:
-        content = torch.load(path, weights_only=True)  # tensors and plain values: no pickled code
-        stored = content["training"]
-    except Exception as error:
-        raise ValueError(f"the checkpoint {path} is damaged ({error}); delete it") from error
-    if stored != _state(training):
-        raise ValueError(
-            f"the checkpoint {path} belongs to another run ({stored}); delete it, or give "
-            "--checkpoint another path"
-        )
-    model.policy.load_state_dict(content["policy"])
-    model.policy.optimizer.load_state_dict(content["optimizer"])
-    for name, rms in _statistics(normalised).items():
-        mean, var, count = content["statistics"][name]
-        rms.mean, rms.var, rms.count = mean.numpy(), var.numpy(), float(count)
-    model.num_timesteps = content["timesteps"]
-    model._n_updates = content["updates"]
-    curve: list[dict[str, float]] = content["curve"]
-    return curve
-
-
-def _rounded(figures: dict[str, float]) -> dict[str, float]:
-    return {key: round(value, 4) for key, value in figures.items()}
 
 
 def _record(
@@ -402,17 +239,11 @@ def _record(
         },
         "training": asdict(training),
         "features": "[p - p_f, theta, dp/dt, dtheta/dt], running normalisation fixed at export",
-        "curve_seed": _CURVE_SEED,
+        "curve_seed": CURVE_SEED,
         "curve": {key: [point[key] for point in curve] for key in curve[0]},
         "final_seed": _FINAL_SEED,
         "final": final,
-        "versions": {
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "gymnasium": gymnasium.__version__,
-            "stable_baselines3": stable_baselines3.__version__,
-            "torch": torch.__version__,
-        },
+        "versions": versions(),
         "machine": platform.machine(),
     }
 

@@ -120,7 +120,7 @@ def pass_aside(
         Shape (K, 2).
     """
     shifted = guess.copy()
-    for other in range(places.shape[1]):
+    for other in np.flatnonzero(meets.any(axis=0)):
         relative = shifted - places[:, other]
         room = np.linalg.norm(relative, axis=-1) - required[:, other]
         room = np.where(meets[:, other], room, np.inf)

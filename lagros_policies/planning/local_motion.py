@@ -34,6 +34,11 @@ class Discs:
         """Return no discs at all."""
         return cls(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, bool))
 
+    def at(self, times: FloatArray) -> FloatArray:
+        """Return the centres at times (k,) [s] from now, shape (k, m, 2) [m]."""
+        value: FloatArray = self.centres + times[:, None, None] * self.velocities
+        return value
+
 
 @dataclass(frozen=True)
 class LocalPlan:
@@ -93,6 +98,7 @@ def responses(edges: FloatArray, times: FloatArray, mass: float) -> tuple[FloatA
         Phi(t) [m/N] and its derivative [m/(N s)], both of shape (k, N).
     """
     since = np.maximum(times[:, None] - edges, 0.0)
-    place = -np.diff(0.5 * since**2, axis=1) / mass
-    speed = -np.diff(since, axis=1) / mass
+    square = (0.5 / mass) * since**2
+    place = square[:, :-1] - square[:, 1:]
+    speed = (since[:, :-1] - since[:, 1:]) / mass
     return place, speed

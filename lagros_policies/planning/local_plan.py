@@ -40,6 +40,8 @@ _NEAR_INSTANTS, _FAR_INSTANTS = 0.25, 0.5
 _LEAST_ROOM = 0.02
 # An agent that lets others go first waits for this share of the foresight.
 _PAUSE = 0.7
+# Instants at which a plan in force is checked are at most this far apart [s].
+_CHECK_SPACING = 0.4
 # Look for another way when the plan in force has become dearer by this much [N^2 s].
 _DEARER = 5e-3
 
@@ -162,7 +164,7 @@ class LocalPlanner:
         if last is not None:
             guess, _ = last.at(problem.times + elapsed)
             aside = problem.aside(guess)
-            best = problem.solve(aside)
+            best = problem.solve(aside, warm=True)
             programs = best.programs
             fresh = fresh or best.cost > last.cost + _DEARER
         if best is None or fresh or not best.solved or best.short > self.settings.tolerance:
@@ -173,6 +175,33 @@ class LocalPlanner:
                     best = found
         assert best is not None  # there is always a way
         return replace(best, programs=programs)
+
+    def shortfall(
+        self, plan: LocalPlan, elapsed: float, goal: FloatArray, discs: Discs, left: float
+    ) -> float:
+        """Return by how much a plan in force falls short of the distances that it should keep now.
+
+        Args:
+            plan: The plan.
+            elapsed: Time since it began [s].
+            goal: Where it ends, shape (2,) [m].
+            discs: What to keep away from, as it is seen now.
+            left: Time until the agent should have arrived [s].
+
+        Returns:
+            The largest shortfall over the rest of the plan, or over the foresight if that is
+            longer [m].
+        """
+        settings = self.settings
+        if len(discs.centres) == 0:
+            return 0.0
+        ends = max(plan.duration - elapsed, settings.foresight)
+        times = np.linspace(0.0, ends, math.ceil(ends / _CHECK_SPACING) + 1)
+        places = plan.at(times + elapsed)[0]
+        required = _required(settings, times, places[0], goal, discs, left)
+        apart = _lengths(places[:, None] - discs.at(times))
+        heeded = _heeded(settings, times, discs)
+        return float(np.max(np.where(heeded, required - apart, 0.0), initial=0.0))
 
 
 class _Problem:
@@ -194,31 +223,17 @@ class _Problem:
         self.edges = np.concatenate(
             [near, np.linspace(settings.foresight, duration, settings.far_steps + 1)]
         )
-        self.times, self.node = _instants(self.edges, settings.foresight)
+        self.lengths = np.diff(self.edges)
+        self.times, self.node = _instants(self.edges, settings)
         self.place, _ = responses(self.edges, self.times, settings.mass)
-        self.speed = responses(self.edges, self.edges[1:-1], settings.mass)[1]
+        ends, self.speed = responses(self.edges, self.edges[1:], settings.mass)
+        self.arrival = np.stack([ends[-1], self.speed[-1]])
+        self.speed = self.speed[:-1]
         self.free = start[:2] + self.times[:, None] * start[2:]
-        self.discs_at = discs.centres + self.times[:, None, None] * discs.velocities
-        self.heeded = (self.times[:, None] <= settings.foresight + 1e-9) | ~discs.moving
-        # Nothing can be imposed at the ends, which are given.
-        self.heeded[[0, -1]] = False
-        self.required = self._required(left)
+        self.discs_at = discs.at(self.times)
+        self.heeded = _heeded(settings, self.times, discs)
+        self.required = _required(settings, self.times, start[:2], goal, discs, left)
         self.limit = np.maximum(settings.speed_limit, np.abs(start[2:]))
-
-    def _required(self, left: float) -> FloatArray:
-        """Return the distances to keep, (K, m): less near ends that lack room."""
-        growth = 0.5 * self.settings.margin_growth
-        discs = self.discs
-        full = discs.touching + discs.margins + _SPARE
-        gap = np.linalg.norm(self.start[:2] - discs.centres, axis=-1)
-        required = np.minimum(full, gap + growth * self.times[:, None] ** 2)
-        # A body may cover the margin of the goal. One that moves is left time to be gone.
-        room = np.linalg.norm(self.goal - discs.centres, axis=-1)
-        room = np.maximum(room, discs.touching + _LEAST_ROOM)
-        room = np.where(discs.moving & (left > 0.0), np.inf, room)
-        remaining = np.maximum(left - self.times, 0.0)
-        value: FloatArray = np.minimum(required, room + growth * remaining[:, None] ** 2)
-        return value
 
     def ways(self) -> Iterator[FloatArray]:
         """Yield guesses (K, 2): around what rests, passing others right, left, or after them."""
@@ -246,54 +261,53 @@ class _Problem:
         deadband = self.settings.deadband
         return pass_aside(guess, self.discs_at, self.required, meets, deadband, left)
 
-    def solve(self, guess: FloatArray) -> LocalPlan:
-        """Iterate from a guess (K, 2)."""
+    def solve(self, guess: FloatArray, warm: bool = False) -> LocalPlan:
+        """Iterate from a guess (K, 2).
+
+        A warm guess is a plan that was iterated before: one program that keeps all distances is
+        enough, and the next plan goes on from there.
+        """
         settings = self.settings
         places, count = guess, 0
         limited = False
-        best = LocalPlan(
-            self.edges,
-            self.start,
-            np.zeros((len(self.edges) - 1, 2)),
-            settings.mass,
-            math.inf,
-            math.inf,
-            False,
-            0,
-        )
+        forces, short, cost = np.zeros((len(self.lengths), 2)), math.inf, math.inf
         for _ in range(settings.passes):
-            forces = self._program(places, limited)
+            found = self._program(places, limited)
             count += 1
-            if forces is None:
+            if found is None:
                 break
-            speeds = self.start[2:] + self.speed @ forces
+            speeds = self.start[2:] + self.speed @ found
             if not limited and np.any(np.abs(speeds) > self.limit + 1e-6):
                 # Most plans are slower than the limit, and the programs half the size without it.
                 limited = True
                 continue
-            places = self.free + self.place @ forces
-            short, cost = self._judge(forces, places)
-            gain = best.cost - cost
-            if cost < best.cost:
-                best = replace(best, forces=forces, short=short, cost=cost, solved=True)
-            if not gain > settings.effort_tolerance * cost:
+            places = self.free + self.place @ found
+            lacks, price = self._judge(found, places)
+            gain = cost - price
+            if gain > 0.0:
+                forces, short, cost = found, lacks, price
+            if not gain > settings.effort_tolerance * price:
                 break
-        return replace(best, programs=count)
+            if warm and short <= settings.tolerance:
+                break
+        solved = math.isfinite(cost)
+        start, mass = self.start, settings.mass
+        return LocalPlan(self.edges, start, forces, mass, short, cost, solved, count)
 
     def _judge(self, forces: FloatArray, places: FloatArray) -> tuple[float, float]:
         """Return the largest shortfall and the cost of a motion."""
         settings = self.settings
-        apart = np.linalg.norm(places[:, None] - self.discs_at, axis=-1)
+        apart = _lengths(places[:, None] - self.discs_at)
         short = np.where(self.heeded, np.maximum(self.required - apart, 0.0), 0.0)
         price = settings.penalty * short + 0.5 * settings.quadratic_penalty * short**2
-        effort = 0.5 * float(np.diff(self.edges) @ np.sum(forces**2, axis=1))
+        effort = 0.5 * float(self.lengths @ np.sum(forces**2, axis=1))
         return float(np.max(short, initial=0.0)), effort + float(np.sum(price))
 
     def _program(self, places: FloatArray, limited: bool) -> FloatArray | None:
         """Solve the quadratic program around positions (K, 2); None if the solver failed."""
-        settings, steps = self.settings, len(self.edges) - 1
+        settings, steps = self.settings, len(self.lengths)
         delta = places[:, None] - self.discs_at
-        apart = np.linalg.norm(delta, axis=-1)
+        apart = _lengths(delta)
         reach = np.where(self.node, settings.reach, 0.5 * settings.reach)
         room = np.where(self.heeded, apart - self.required - reach[:, None], np.inf)
         instant, disc = np.nonzero(room < 0.0)
@@ -310,7 +324,7 @@ class _Problem:
         inequality = np.zeros((rows, size))
         inequality[:, :steps] = normal[:, :1] * self.place[instant]
         inequality[:, steps : 2 * steps] = normal[:, 1:] * self.place[instant]
-        inequality[:, 2 * steps :] = np.eye(rows)
+        inequality[np.arange(rows), 2 * steps + np.arange(rows)] = 1.0
         if limited:
             bound = np.zeros((2 * len(self.speed), size))
             bound[: len(self.speed), :steps] = self.speed
@@ -319,7 +333,7 @@ class _Problem:
             inequality = np.vstack([inequality, bound])
             low, high = np.concatenate([low, -limit - now]), np.concatenate([high, limit - now])
         diagonal = np.full(size, settings.quadratic_penalty)
-        diagonal[: 2 * steps] = np.tile(np.diff(self.edges), 2)
+        diagonal[: 2 * steps] = np.tile(self.lengths, 2)
         linear = np.zeros(size)
         linear[2 * steps :] = settings.penalty
         least = np.full(size, -_UNBOUNDED)
@@ -332,23 +346,65 @@ class _Problem:
 
     def _arrival(self, size: int) -> tuple[FloatArray, FloatArray]:
         """Return the equalities that end the plan at rest at the goal."""
-        steps = len(self.edges) - 1
-        place, speed = responses(self.edges, self.edges[-1:], self.settings.mass)
-        both = np.vstack([place, speed])
+        steps = len(self.lengths)
         equality = np.zeros((4, size))
-        equality[:2, :steps] = equality[2:, steps : 2 * steps] = both
+        equality[:2, :steps] = equality[2:, steps : 2 * steps] = self.arrival
         free = self.start[:2] + self.edges[-1] * self.start[2:]
         target = np.stack([self.goal - free, -self.start[2:]], axis=1).ravel()
         return equality, target
 
 
-def _instants(edges: FloatArray, foresight: float) -> tuple[FloatArray, BoolArray]:
+def _instants(
+    edges: FloatArray, settings: LocalPlannerSettings
+) -> tuple[FloatArray, BoolArray]:
     """Return where distances are looked at, (K,) [s], and which of them are nodes."""
-    spacing = np.where(edges[1:] <= foresight + 1e-9, _NEAR_INSTANTS, _FAR_INSTANTS)
-    counts = np.maximum(np.ceil(np.diff(edges) / spacing - 1e-9), 1).astype(int)
-    share = np.concatenate([np.arange(count) / count for count in counts])
-    times = np.repeat(edges[:-1], counts) + share * np.repeat(np.diff(edges), counts)
-    return np.append(times, edges[-1]), np.append(share == 0.0, True)
+    parts = []
+    # Steps are alike before the foresight, and after it.
+    for some, spacing in (
+        (edges[: settings.near_steps + 1], _NEAR_INSTANTS),
+        (edges[settings.near_steps :], _FAR_INSTANTS),
+    ):
+        count = max(math.ceil((some[1] - some[0]) / spacing - 1e-9), 1)
+        share = np.arange(count) / count
+        parts.append((some[:-1, None] + share * (some[1] - some[0])).ravel())
+        parts.append(np.tile(share == 0.0, len(some) - 1))
+    times = np.concatenate([parts[0], parts[2], edges[-1:]])
+    return times, np.concatenate([parts[1], parts[3], [True]])
+
+
+def _heeded(settings: LocalPlannerSettings, times: FloatArray, discs: Discs) -> BoolArray:
+    """Return which discs are heeded when, (K, m); nothing can be imposed at the given ends."""
+    heeded: BoolArray = (times[:, None] <= settings.foresight + 1e-9) | ~discs.moving
+    heeded[0] = heeded[-1] = False
+    return heeded
+
+
+def _required(
+    settings: LocalPlannerSettings,
+    times: FloatArray,
+    start: FloatArray,
+    goal: FloatArray,
+    discs: Discs,
+    left: float,
+) -> FloatArray:
+    """Return the distances to keep, (K, m): less near ends that lack room."""
+    growth = 0.5 * settings.margin_growth
+    full = discs.touching + discs.margins + _SPARE
+    gap = _lengths(start - discs.centres)
+    required = np.minimum(full, gap + growth * times[:, None] ** 2)
+    # A body may cover the margin of the goal. One that moves is left time to be gone.
+    room = np.maximum(_lengths(goal - discs.centres), discs.touching + _LEAST_ROOM)
+    room = np.where(discs.moving & (left > 0.0), np.inf, room)
+    remaining = np.maximum(left - times, 0.0)
+    value: FloatArray = np.minimum(required, room + growth * remaining[:, None] ** 2)
+    return value
+
+
+def _lengths(vectors: FloatArray) -> FloatArray:
+    """Return the lengths (...) of vectors (..., 2); several times as fast as `norm`."""
+    x, y = vectors[..., 0], vectors[..., 1]
+    value: FloatArray = np.sqrt(x * x + y * y)
+    return value
 
 
 def _solve(

@@ -39,7 +39,6 @@ def faked(monkeypatch):
     ("arguments", "message"),
     [
         (("cartpol",), "unknown task 'cartpol'. Did you mean 'cartpole'?"),
-        (("spacecraft",), "'spacecraft' is not there yet"),
         (("cartpole", "--policies", "lagors,lqr"), "Did you mean 'lagros'? Valid: learned,"),
         (("cartpole", "--policies", "ppo2.zip"), "there is no file 'ppo2.zip'"),
         (("cartpole", "--policies", ","), "policies must not be empty"),

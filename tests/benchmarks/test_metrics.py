@@ -10,6 +10,8 @@ import pytest
 
 from lagros_benchmarks.metrics import (
     carry_forward,
+    cluster_interval,
+    cluster_rate_interval,
     effort_ratio,
     mean_interval,
     paired_success_difference,
@@ -129,3 +131,57 @@ def test_step_times():
 def test_a_curve_that_ends_early_keeps_its_largest_value():
     curves = np.array([[0.0, 3.0, 2.0, np.nan, np.nan], [0.0, 1.0, 2.0, 1.0, 1.0]])
     assert carry_forward(curves).tolist() == [[0.0, 3.0, 2.0, 3.0, 3.0], [0.0, 1.0, 2.0, 1.0, 1.0]]
+
+
+def test_trials_of_a_cluster_that_are_alike_count_once():
+    rng = np.random.default_rng(1)
+    alike = rng.random(100) < 0.7
+    interval = cluster_rate_interval((6 * alike).tolist(), [6] * 100)
+    # As if each cluster were one trial, whose interval of a mean is the textbook's.
+    rate = alike.mean()
+    wide = 1.96 * math.sqrt(rate * (1 - rate) / 100)
+    assert interval == pytest.approx((rate - wide, rate + wide), abs=0.015)
+
+
+def test_independent_trials_may_as_well_not_come_in_clusters():
+    successes = np.random.default_rng(2).binomial(6, 0.7, 400)
+    interval = cluster_rate_interval(successes.tolist(), [6] * 400)
+    assert interval == pytest.approx(wilson_interval(int(successes.sum()), 2400), abs=0.006)
+
+
+def test_the_interval_of_a_rate_covers_it_as_often_as_it_says():
+    """Worlds whose agents share their fate: 95 % of intervals, give or take, hold the truth."""
+    rng = np.random.default_rng(3)
+    rates = rng.beta(1.0, 0.5, (300, 60))
+    counts = rng.binomial(6, rates)
+    intervals = [cluster_rate_interval(row.tolist(), [6] * 60) for row in counts]
+    covered = np.mean([low <= 4 / 6 <= high for low, high in intervals])
+    assert 0.91 <= covered <= 0.985
+    over_trials = [wilson_interval(int(row.sum()), 360) for row in counts]
+    # Wilson's over all agents, which takes them for independent, does not.
+    assert np.mean([low <= 4 / 6 <= high for low, high in over_trials]) < 0.85
+
+
+def test_where_all_agree_every_cluster_is_one_trial():
+    assert cluster_rate_interval([6] * 50, [6] * 50) == wilson_interval(50, 50)
+    assert cluster_rate_interval([0] * 50, [6] * 50) == wilson_interval(0, 50)
+    assert cluster_rate_interval([2], [6]) == wilson_interval(2, 6)
+
+
+def test_the_interval_of_a_ratio_is_exact_where_all_clusters_agree():
+    weights = [1.0, 5.0, 2.0, 9.0]
+    assert cluster_interval(2.5 * np.array(weights), weights) == pytest.approx((2.5, 2.5))
+
+
+def test_empty_clusters_change_no_interval():
+    rng = np.random.default_rng(4)
+    above, below = rng.random(30), rng.random(30)
+    interval = cluster_interval(above, below)
+    padded = cluster_interval([*above, 0.0, 0.0], [*below, 0.0, 0.0])
+    assert padded == interval
+
+
+def test_no_interval_without_two_finite_clusters():
+    assert cluster_interval([1.0], [1.0]) is None
+    assert cluster_interval([1.0, 2.0], [1.0, 0.0]) is None
+    assert cluster_interval([1.0, math.inf], [1.0, 1.0]) is None

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from lagros_benchmarks import figures, files, tables
+from lagros_benchmarks import figures, files, formats, tables
 from lagros_benchmarks.records import summarise
 from lagros_benchmarks.runner import run_benchmark
 from lagros_benchmarks.settings import BenchmarkSettings
@@ -68,7 +68,7 @@ def test_what_is_not_finite_becomes_null(tmp_path):
 
 def printed(rows):
     console = Console(file=io.StringIO(), width=80, highlight=False)
-    for group in tables.by_condition(rows):
+    for group in formats.by_condition(rows):
         console.print(tables.terminal_table(group))
     return console.file.getvalue()
 
@@ -124,7 +124,7 @@ def test_lines_below_the_table_name_the_reference_and_the_errors(rows):
     ],
 )
 def test_numbers_have_three_digits(value, text):
-    assert tables.number(value) == text
+    assert formats.number(value) == text
 
 
 @pytest.mark.parametrize(
@@ -132,12 +132,12 @@ def test_numbers_have_three_digits(value, text):
     [(1.0, "100.0"), (0.9996, "99.9"), (0.0, "0.0"), (0.0004, "<0.1"), (0.5, "50.0"), (None, "–")],
 )
 def test_percent_rounds_to_certainty_only_if_it_is(rate, text):
-    assert tables.percent(rate) == text
+    assert formats.percent(rate) == text
 
 
 def test_the_paper_letters_its_methods():
-    assert tables.policy_label("tube-mpc") == "(b) tube-mpc"
-    assert tables.policy_label("runs/ppo.zip") == "ppo.zip"
+    assert formats.policy_label("tube-mpc") == "(b) tube-mpc"
+    assert formats.policy_label("runs/ppo.zip") == "ppo.zip"
 
 
 def test_csv_has_a_line_per_row_and_no_curves(rows):

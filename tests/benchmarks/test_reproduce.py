@@ -7,9 +7,15 @@ import filecmp
 import pytest
 
 from lagros_benchmarks.reproduce import ReproduceSettings, reproduce_cartpole
+from lagros_benchmarks.reproduce_spacecraft import (
+    SpacecraftReproduceSettings,
+    reproduce_spacecraft,
+)
 from lagros_benchmarks.runner import run_benchmark
 from lagros_policies.imitation.dataset import ExpertDataSettings
+from lagros_policies.imitation.spacecraft_flights import FlightSettings
 from lagros_policies.imitation.train import TrainingSettings
+from lagros_policies.imitation.train_deep_set import DeepSetTraining
 from lagros_policies.metric_design import MetricDesignSettings
 
 FILES = (
@@ -62,3 +68,51 @@ def test_an_interrupted_run_ends_with_the_files_of_one_that_was_not(tmp_path):
     other = TrainingSettings(hidden=(16,), epochs=5)
     with pytest.raises(ValueError, match="other settings"):
         reproduce_cartpole(tmp_path / "whole", small(lagros=other))
+
+
+SPACECRAFT_FILES = tuple(
+    f"spacecraft_{name}.{suffix}"
+    for name in ("lagros", "learned")
+    for suffix in ("safetensors", "json")
+)
+
+
+def small_spacecraft():
+    flights = FlightSettings(worlds=2, worlds_per_shard=1, agents=(2,))
+    training = DeepSetTraining((8,), (8,), epochs=2)
+    return SpacecraftReproduceSettings(
+        flights=flights,
+        calm=FlightSettings(
+            worlds=1, worlds_per_shard=1, agents=(2,), disturbance_bound=0.0, seed=1
+        ),
+        rounds=(
+            FlightSettings(worlds=2, worlds_per_shard=1, agents=(2,), replan_period=9.0, seed=2),
+        ),
+        held_out=0.5,
+        intermediate=training,
+        lagros=training,
+        learned=training,
+        worlds=1,
+        bounds=(0.4,),
+        jobs=1,
+    )
+
+
+@pytest.mark.slow
+def test_the_spacecraft_run_is_resumed_and_ends_with_the_same_files(tmp_path):
+    benchmark = reproduce_spacecraft(tmp_path / "whole", small_spacecraft())
+
+    def stop_in_flight(title, done, total):
+        if title == "relabelled1" and done == 1:
+            raise InterruptedRunError
+
+    with pytest.raises(InterruptedRunError):
+        reproduce_spacecraft(tmp_path / "broken", small_spacecraft(), stop_in_flight)
+    assert not (tmp_path / "broken" / "spacecraft_lagros.safetensors").exists()
+    reproduce_spacecraft(tmp_path / "broken", small_spacecraft())
+    same, different, missing = filecmp.cmpfiles(
+        tmp_path / "whole", tmp_path / "broken", SPACECRAFT_FILES, shallow=False
+    )
+    assert (sorted(same), different, missing) == (sorted(SPACECRAFT_FILES), [], [])
+    assert {"learned", "tube-mpc", "lagros", "centralized"} == set(benchmark.policies)
+    assert str(tmp_path) in benchmark.policy_settings["lagros"]["weights"]

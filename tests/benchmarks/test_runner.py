@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from lagros_benchmarks.cartpole_experiment import plan_nominals
 from lagros_benchmarks.library import SetupError
-from lagros_benchmarks.runner import Case, plan_nominals, run_benchmark
+from lagros_benchmarks.runner import Case, run_benchmark
 from lagros_benchmarks.settings import BenchmarkSettings, Condition
 from tests.benchmarks import fakes
 

@@ -7,13 +7,13 @@ import pytest
 import lagros_policies
 from lagros_benchmarks.settings import BenchmarkSettings, check_policy
 from lagros_envs.seeding import EVALUATION, episode_seeds
+from lagros_policies.policy import SPACECRAFT_NAMES
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"task": "cartpol"}, "Did you mean 'cartpole'"),
-        ({"task": "spacecraft"}, "not there yet"),
         ({"disturbances": ("unifrom",)}, "Did you mean 'uniform'.*none, uniform, sphere"),
         ({"bounds": (float("nan"),)}, "finite"),
         ({"bounds": (-0.1,)}, ">= 0"),
@@ -30,6 +30,45 @@ from lagros_envs.seeding import EVALUATION, episode_seeds
 def test_a_wrong_setting_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         BenchmarkSettings(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"preset": "papper"}, "Did you mean 'paper'. Valid: paper, released, crossing"),
+        ({"safety_filter": "some"}, "Valid: none, all, both"),
+        ({"agents": ()}, "agents must not be empty"),
+        ({"agents": (0,)}, "agents=0 must be at least 1"),
+        ({"agents": (3, 3)}, "twice"),
+        ({"disturbances": ("uniform", "worst")}, "'worst' pushes away from one nominal"),
+    ],
+)
+def test_a_wrong_setting_of_the_spacecraft_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        BenchmarkSettings.for_task("spacecraft", **changes)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"preset": "paper"}, {"agents": (6,)}, {"safety_filter": "both"}]
+)
+def test_the_cart_pole_has_no_settings_of_the_spacecraft(changes):
+    with pytest.raises(ValueError, match="for the task spacecraft; leave it out"):
+        BenchmarkSettings.for_task("cartpole", **changes)
+
+
+def test_each_task_has_its_own_defaults():
+    assert BenchmarkSettings.for_task("cartpole", bounds=None) == BenchmarkSettings()
+    settings = BenchmarkSettings.for_task("spacecraft", episodes=None, jobs=2)
+    assert settings.policies == SPACECRAFT_NAMES
+    assert settings.bounds == (0.2, 0.4, 0.6, 0.8, 1.0)
+    assert (settings.preset, settings.agents, settings.jobs) == ("paper", (6,), 2)
+    # Every policy with and without the filter.
+    assert len(settings.cases) == 4 * 2 * 5
+    # A comparison of numbers of agents has one bound, unless more are asked for.
+    assert BenchmarkSettings.for_task("spacecraft", agents=(1, 6)).bounds == (0.4,)
+    assert BenchmarkSettings.for_task("spacecraft", agents=(1, 6), bounds=(1.0,)).bounds == (1.0,)
+    with pytest.raises(ValueError, match="Did you mean 'spacecraft'"):
+        BenchmarkSettings.for_task("spacecrafts")
 
 
 def test_every_kind_meets_every_bound_and_none_comes_once():
@@ -55,6 +94,15 @@ def test_evaluation_never_meets_a_training_scenario(seed):
 @pytest.mark.parametrize("name", lagros_policies.NAMES)
 def test_every_name_of_the_library_is_a_policy(name):
     check_policy(name)
+
+
+def test_the_names_are_those_of_the_task():
+    for name in SPACECRAFT_NAMES:
+        check_policy(name, "spacecraft")
+    with pytest.raises(ValueError, match="unknown policy 'centralized'"):
+        check_policy("centralized")
+    with pytest.raises(ValueError, match="Valid: learned, tube-mpc, lagros, centralized,"):
+        check_policy("lqr", "spacecraft")
 
 
 def test_a_policy_may_be_a_file(tmp_path):

@@ -1,0 +1,245 @@
+"""The spacecraft's part of a benchmark: its worlds, its policies with and without the filter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from lagros_benchmarks.episodes import describe_error
+from lagros_benchmarks.experiment import BenchmarkRun
+from lagros_benchmarks.library import FloatArray, Policy, SetupError, Toolbox
+from lagros_benchmarks.settings import BenchmarkSettings, Case
+from lagros_benchmarks.spacecraft_episodes import (
+    Flight,
+    Trace,
+    WorldRecord,
+    act,
+    bare,
+    fly,
+    fly_chunk,
+    is_global,
+)
+from lagros_benchmarks.spacecraft_timing import PLAN_WORLDS, Timing, time_plans, time_policy
+from lagros_benchmarks.workers import Progress
+from lagros_envs.scenarios import Scenario
+from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+
+Value = TypeVar("Value")
+
+# Policies that prepare for a disturbance bound, which they are told.
+_TOLD_THE_BOUND = ("tube-mpc", "centralized")
+
+
+@dataclass(frozen=True)
+class SpacecraftRun(BenchmarkRun):
+    """All worlds of a spacecraft benchmark.
+
+    Attributes:
+        counters: What the policy of each case counts, summed over the worlds.
+    """
+
+    episodes: Mapping[Case, Sequence[WorldRecord]]
+    timing: Mapping[Case, Sequence[Timing]]
+    counters: Mapping[Case, Mapping[str, int]]
+
+
+@dataclass(frozen=True)
+class ScenePanel:
+    """One policy in the world of a scene.
+
+    Attributes:
+        case: The policy, and what it met.
+        path: Positions at every control instant, shape (instants, agents, 2) [m].
+        world: What happened.
+    """
+
+    case: Case
+    path: FloatArray
+    world: WorldRecord
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Several policies in the same world under the same disturbance.
+
+    Attributes:
+        scenario: Starts, goals and obstacles.
+        arena: Side of the square in which everything was placed [m].
+        goal_radius: Distance at which an agent has arrived [m].
+        control_period: Time between the instants of a path [s].
+        panels: One per policy.
+    """
+
+    scenario: Scenario
+    arena: float
+    goal_radius: float
+    control_period: float
+    panels: tuple[ScenePanel, ...]
+
+
+@dataclass(frozen=True)
+class SpacecraftExperiment:
+    """See `lagros_benchmarks.experiment.Experiment`."""
+
+    settings: BenchmarkSettings
+    toolbox: Toolbox
+    control_period: float
+
+    @classmethod
+    def set_up(cls, settings: BenchmarkSettings, toolbox: Toolbox) -> SpacecraftExperiment:
+        """Build everything once, so that a damaged file ends the run before it has begun.
+
+        Raises:
+            SetupError: A policy cannot be built, or no scenario can be drawn.
+        """
+        experiment = cls(settings, toolbox, 0.0)
+        building = "the environment"
+        period = 0.0
+        try:
+            for case in settings.cases:
+                building = f"the environment of {case.agents} agents"
+                env = experiment.environment(case, 1)
+                env.reset(seed=[0])
+                period = env.settings.control_period
+                building = f"policy {case.policy!r}"
+                building += " with the safety filter" if case.safety_filter else ""
+                experiment.policy(case, env)
+        except Exception as error:
+            raise SetupError(f"{building} cannot be built: {describe_error(error)}") from error
+        return cls(settings, toolbox, period)
+
+    @property
+    def timed_apart(self) -> bool:
+        """Always: a batch of worlds tells nothing about one decision."""
+        return True
+
+    def environment(self, case: Case, worlds: int) -> SpacecraftVectorEnv:
+        """Return worlds of a case."""
+        agents = case.agents or 1
+        return SpacecraftVectorEnv(
+            worlds * agents,
+            agents,
+            self.settings.preset or "paper",
+            case.condition.kind,
+            case.condition.bound,
+            "all" if self.settings.channels == "all" else "rates",
+            autoreset_mode="disabled",
+        )
+
+    def policy(self, case: Case, env: SpacecraftVectorEnv) -> Policy:
+        """Build the policy of a case, with its filter."""
+        name, bound = case.policy, case.condition.bound
+        told = {"disturbance_bound": bound} if name in _TOLD_THE_BOUND else {}
+        settings = {**told, **self.settings.policy_settings.get(name, {})}
+        policy = self.toolbox.make_policy(name, env, settings)
+        return self.toolbox.make_filter(policy, env, bound) if case.safety_filter else policy
+
+    def units(self, progress: Progress | None) -> list[int]:
+        """Return the seed of every world: each policy plans for itself."""
+        return self.settings.episode_seeds()
+
+    def play(self, case: Case, units: Sequence[int]) -> Flight:
+        """Fly a chunk of worlds."""
+        policy = self.policy(case, self.environment(case, 1))
+        margin = self._margin(policy, case)
+
+        def worlds(count: int) -> SpacecraftVectorEnv:
+            return self.environment(case, count)
+
+        return fly_chunk(worlds, policy, units, margin)
+
+    def time(self, case: Case, units: Sequence[int]) -> list[Timing]:
+        """Measure the times of the calls, and of more plans than those worlds need."""
+        env = self.environment(case, 1)
+        policy = self.policy(case, env)
+        _warm_up(env, policy)
+        timing = time_policy(env, policy, units)
+        if not is_global(policy):
+            return [timing]
+        further = self.settings.episode_seeds()[len(units) : PLAN_WORLDS]
+        plans = np.concatenate([timing.plans, time_plans(env, policy, further)])
+        return [Timing(timing.steps, timing.batches, plans, timing.agents)]
+
+    def finish(
+        self,
+        units: Sequence[int],
+        outcomes: Mapping[Case, Sequence[Flight]],
+        timing: Mapping[Case, Any] | None,
+    ) -> SpacecraftRun:
+        """Put the run together."""
+        counters: dict[Case, dict[str, int]] = {}
+        for case, flights in outcomes.items():
+            counters[case] = {}
+            for flight in flights:
+                for name, count in flight.counters.items():
+                    counters[case][name] = counters[case].get(name, 0) + count
+        return SpacecraftRun(
+            settings=self.settings,
+            episodes={
+                case: [world for flight in flights for world in flight.worlds]
+                for case, flights in outcomes.items()
+            },
+            timing=timing or {},
+            control_period=self.control_period,
+            counters=counters,
+        )
+
+    def _margin(self, policy: Policy, case: Case) -> float | None:
+        return self.toolbox.position_margin(bare(policy), case.condition.bound)
+
+
+def fly_scene(settings: BenchmarkSettings, world: int, toolbox: Toolbox) -> Scene:
+    """Fly one world of a run again with every policy, and keep where everybody was.
+
+    With several bounds or numbers of agents it is the middle one (the lower of two); with the
+    filter only where the run has no policy without it.
+
+    Args:
+        settings: Those of the run.
+        world: Which of its worlds, from 0.
+        toolbox: As for `run_benchmark`.
+
+    Raises:
+        ValueError: The run has no such world.
+    """
+    seeds = settings.episode_seeds()
+    if not 0 <= world < len(seeds):
+        raise ValueError(f"scene world {world} must be one of the run: 0 to {len(seeds) - 1}")
+    experiment = SpacecraftExperiment(settings, toolbox, 0.0)
+    agents = _middle(sorted(settings.agents))
+    condition = _middle(sorted(settings.conditions, key=lambda condition: condition.bound))
+    filtered = settings.cases[0].safety_filter
+    panels = []
+    for policy in settings.policies:
+        case = Case(policy, condition, filtered, agents)
+        env = experiment.environment(case, 1)
+        trace = Trace()
+        flight = fly(env, experiment.policy(case, env), [seeds[world]], None, trace, True)
+        panels.append(ScenePanel(case, np.array(trace.path)[:, 0], flight.worlds[0]))
+    scenario = env.scenarios[0]
+    if scenario is None:
+        raise RuntimeError("the world of the scene was not begun")
+    return Scene(
+        scenario,
+        env.preset.arena,
+        env.settings.goal_radius,
+        env.settings.control_period,
+        tuple(panels),
+    )
+
+
+def _middle(values: Sequence[Value]) -> Value:
+    return values[(len(values) - 1) // 2]
+
+
+def _warm_up(env: SpacecraftVectorEnv, policy: Policy) -> None:
+    """Call the policy once, so that what its first call loads is not timed."""
+    rows, _ = env.reset(seed=[0])
+    # An exception is the episodes' business, where it is written down.
+    try:
+        act(policy, env, rows, None, first=True)
+    except Exception:
+        return

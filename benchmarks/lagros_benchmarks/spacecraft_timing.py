@@ -1,0 +1,123 @@
+"""How long spacecraft policies take: a serial pass, one world at a time, one call per step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lagros_benchmarks.library import FloatArray, Policy
+from lagros_benchmarks.spacecraft_episodes import Float32Array, act, is_global
+from lagros_envs.seeding import episode_streams
+from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+
+# A joint plan is made once a world, so that the few worlds of the pass would time too few plans.
+PLAN_WORLDS = 50
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Times of calls of `predict`, with the conversion of their results [s].
+
+    Attributes:
+        steps: Calls for one agent alone, its decision; of a policy for all agents together, every
+            call after the first of an episode.
+        batches: Calls for all agents of a world together, at every step.
+        plans: First calls of a policy for all agents together, which plans in them; else empty.
+        agents: Agents of a world.
+    """
+
+    steps: FloatArray
+    batches: FloatArray
+    plans: FloatArray
+    agents: int
+
+
+def time_policy(env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int]) -> Timing:
+    """Fly the episodes again for the times of the calls.
+
+    A local policy is called twice at every step: for all agents of the world, which flies it, and
+    for one of them alone with a memory of its own, as it would run on board. The agent changes from
+    world to world. What raises ends the times of its episode; the records have its text.
+
+    Args:
+        env: One world, without autoreset.
+        policy: The policy.
+        seeds: Seeds of the episodes.
+
+    Returns:
+        The times.
+    """
+    steps: list[float] = []
+    batches: list[float] = []
+    plans: list[float] = []
+    for index, seed in enumerate(seeds):
+        alone = None if is_global(policy) else index % env.num_agents
+        times = _WorldTimes([], [])
+        try:
+            _time_world(env, policy, seed, alone, times)
+        except Exception:
+            if not times.batches:
+                continue
+        batches += times.batches
+        if alone is None:
+            plans += times.batches[:1]
+            steps += times.batches[1:]
+        else:
+            steps += times.alone
+    return Timing(np.array(steps), np.array(batches), np.array(plans), env.num_agents)
+
+
+def time_plans(env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int]) -> FloatArray:
+    """Return the times of the first calls alone [s], of a policy for all agents together."""
+    times = []
+    for seed in seeds:
+        try:
+            rows, _ = env.reset(seed=[seed])
+            begin = perf_counter()
+            act(policy, env, rows, None, first=True)
+        except Exception:
+            continue  # as above
+        times.append(perf_counter() - begin)
+    return np.array(times)
+
+
+@dataclass(frozen=True)
+class _WorldTimes:
+    """Times of the calls of one world for all agents, and for one alone."""
+
+    batches: list[float]
+    alone: list[float]
+
+
+def _time_world(
+    env: SpacecraftVectorEnv, policy: Policy, seed: int, alone: int | None, times: _WorldTimes
+) -> None:
+    reseed = getattr(policy, "reseed", None)
+    if reseed is not None:
+        reseed(episode_streams(seed).policy)
+    rows, _ = env.reset(seed=[seed])
+    state: Any = None
+    own_state: Any = None
+    for step in range(env.settings.steps):
+        first = step == 0
+        begin = perf_counter()
+        action, state = act(policy, env, rows, state, first)
+        times.batches.append(perf_counter() - begin)
+        if alone is not None:
+            seconds, own_state = _time_alone(policy, rows[alone : alone + 1], own_state, first)
+            times.alone.append(seconds)
+        rows, _, terminated, truncated, _ = env.step(action)
+        if (terminated | truncated).any():
+            return
+
+
+def _time_alone(policy: Policy, row: Float32Array, state: Any, first: bool) -> tuple[float, Any]:
+    start = np.array([first])
+    begin = perf_counter()
+    action, state = policy.predict(row, state, start, True)
+    np.asarray(action, dtype=np.float32)
+    return perf_counter() - begin, state

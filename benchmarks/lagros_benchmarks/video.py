@@ -1,0 +1,192 @@
+"""Frames into a GIF or an MP4, written whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import itertools
+import os
+import subprocess
+import tempfile
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_benchmarks.files import write_atomic
+
+Frame = NDArray[np.uint8]
+
+# Most frames per second that are worth their bytes.
+FRAME_RATES = {".gif": 6.0, ".mp4": 25.0}
+# A GIF's palette is taken from so many frames. Its first half are the commonest colours, which
+# are the areas of the drawing, exact; the rest are others that are far from all of these: fewer
+# shades at the edges take fewer bytes.
+_PALETTE_FRAMES = 8
+_PALETTE_SIZE = 64
+_NEAREST_AREAS, _NEAREST_SHADES = 6.0, 32.0
+
+
+def check_video_path(path: Path) -> None:
+    """Check the suffix of a video, and that what writes it is installed.
+
+    Raises:
+        ValueError: The suffix is neither .gif nor .mp4.
+        ImportError: The package that writes this kind is not installed.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in FRAME_RATES:
+        raise ValueError(f"video {str(path)!r} must end in .gif or .mp4")
+    if suffix == ".mp4":
+        _import_ffmpeg()
+    else:
+        _import_pillow()
+
+
+def write_video(path: Path, frames: Iterable[Frame], rate: float) -> Path:
+    """Write a video; its suffix says which kind.
+
+    Args:
+        path: Ends in .gif or .mp4; its folder is made if need be.
+        frames: Each of one shape (height, width, 3), height and width even.
+        rate: Frames per second. A GIF counts in hundredths of a second and takes the nearest.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: The suffix is another, or there is no frame.
+        ImportError: The package that writes this kind is not installed.
+        OSError: The file cannot be written.
+    """
+    check_video_path(path)
+    if path.suffix.lower() == ".gif":
+        return write_atomic(path, gif_bytes(frames, rate))
+    return _write_mp4(path, frames, rate)
+
+
+def gif_bytes(frames: Iterable[Frame], rate: float) -> bytes:
+    """Return the frames as a GIF that repeats, with one palette for all of them.
+
+    One palette without dithering leaves what does not move unchanged from frame to frame, which is
+    what a GIF compresses well.
+
+    Args:
+        frames: As in `write_video`.
+        rate: Frames per second.
+
+    Raises:
+        ValueError: There is no frame.
+        ImportError: pillow is not installed.
+    """
+    image = _import_pillow()
+    # Drawings compress a hundredfold, so that a long episode fits into memory.
+    packed, shape = [], (0, 0, 0)
+    for frame in frames:
+        packed.append(zlib.compress(np.ascontiguousarray(frame).tobytes(), 1))
+        shape = frame.shape
+    if not packed:
+        raise ValueError("there is no frame to write")
+
+    def unpacked(data: bytes) -> Any:
+        return image.fromarray(np.frombuffer(zlib.decompress(data), np.uint8).reshape(shape))
+
+    chosen = np.unique(np.linspace(0, len(packed) - 1, _PALETTE_FRAMES).round().astype(int))
+    sample = np.concatenate([np.asarray(unpacked(packed[index])) for index in chosen])
+    palette = image.new("P", (1, 1))
+    palette.putpalette(common_colours(sample).ravel().tolist())
+    images = (unpacked(data).quantize(palette=palette, dither=image.Dither.NONE) for data in packed)
+    stream = io.BytesIO()
+    next(images).save(
+        stream,
+        format="GIF",
+        save_all=True,
+        append_images=images,
+        duration=max(20, 10 * round(100.0 / rate)),  # [ms]; viewers slow down what is faster
+        loop=0,
+        optimize=False,
+    )
+    return stream.getvalue()
+
+
+def common_colours(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the palette of a drawing, commonest colours first.
+
+    Args:
+        pixels: Shape (..., 3).
+
+    Returns:
+        Shape (k, 3) with k at most 64.
+    """
+    red, green, blue = np.moveaxis(pixels.reshape(-1, 3).astype(np.int64), -1, 0)
+    codes, counts = np.unique((red << 16) | (green << 8) | blue, return_counts=True)
+    codes = codes[np.argsort(-counts, kind="stable")]
+    left = np.stack([codes >> 16, (codes >> 8) & 255, codes & 255], axis=-1)
+    chosen: list[NDArray[np.int64]] = []
+    while left.size and len(chosen) < _PALETTE_SIZE:
+        chosen.append(left[0])
+        nearest = _NEAREST_AREAS
+        if len(chosen) >= _PALETTE_SIZE // 2:
+            # From here on what is near an area counts as that area, too.
+            nearest = _NEAREST_SHADES
+        apart = np.min(np.sum((left[:, None] - np.array(chosen)[None]) ** 2, axis=-1), axis=1)
+        left = left[apart >= nearest**2]
+    return np.array(chosen, np.uint8)
+
+
+def _write_mp4(path: Path, frames: Iterable[Frame], rate: float) -> Path:
+    ffmpeg = _import_ffmpeg()
+    iterator: Iterator[Frame] = iter(frames)
+    first = next(iterator, None)
+    if first is None:
+        raise ValueError("there is no frame to write")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # ffmpeg tells the format from the suffix.
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.mp4")
+    height, width, _ = first.shape
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{rate:.6g}"]
+    # yuv420p is what every player shows; faststart lets a page play it while it loads.
+    coded = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "23", "-movflags", "+faststart"]
+    quiet = [ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
+    command = [*quiet, *raw, "-i", "-", "-an", *coded, str(temporary)]
+    try:
+        with tempfile.TemporaryFile() as complaints:
+            # If ffmpeg gives up it closes the pipe, and its return code says so.
+            with (
+                contextlib.suppress(BrokenPipeError),
+                subprocess.Popen(command, stdin=subprocess.PIPE, stderr=complaints) as process,
+            ):
+                for frame in itertools.chain([first], iterator):
+                    cast(IO[bytes], process.stdin).write(np.ascontiguousarray(frame).tobytes())
+            if process.returncode != 0:
+                complaints.seek(0)
+                text = complaints.read().decode(errors="replace").strip()
+                raise OSError(f"ffmpeg could not write {str(path)!r}: {text}")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def _import_ffmpeg() -> Any:
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise ImportError(
+            'an .mp4 needs imageio-ffmpeg, which is not installed: pip install "lagros[video]"; '
+            "or write a .gif"
+        ) from error
+    return imageio_ffmpeg
+
+
+def _import_pillow() -> Any:
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError(
+            'a .gif needs pillow, which is not installed: pip install "lagros[bench]"'
+        ) from error
+    return Image

@@ -1,0 +1,107 @@
+"""`lagros watch`: one episode as it moves, in a window or as a video.
+
+Only the standard library and typer are imported here; the command imports the rest.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def watch(
+    task: Annotated[str, typer.Argument(help="cartpole or spacecraft.")],
+    policy: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="A policy of the task, a stable-baselines3 .zip, or module:Class.",
+        ),
+    ] = "lagros",
+    agents: Annotated[
+        int | None, typer.Option(help="Number of spacecraft; the preset's own if not given.")
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help="Of paper, released, crossing, open, swarm. (default: paper)"),
+    ] = None,
+    disturbance: Annotated[
+        str,
+        typer.Option(help="Of none, uniform, sphere, constant, sinusoid, gust."),
+    ] = "uniform",
+    bound: Annotated[
+        float | None,
+        typer.Option(
+            help="Bound d̄ of the disturbance, in units of the state per second. "
+            "(default: 0.75 for cartpole, 0.4 for spacecraft)"
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
+    scenario: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", dir_okay=False, help="A scenario as JSON, in place of the drawn one."
+        ),
+    ] = None,
+    safety_filter: Annotated[
+        bool, typer.Option("--safety-filter", help="Put the safety filter on the policy.")
+    ] = False,
+    video: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            dir_okay=False,
+            help="Write a .gif or .mp4 instead of opening a window.",
+        ),
+    ] = None,
+    speed: Annotated[float, typer.Option(help="How much faster than real time it plays.")] = 4.0,
+    seconds: Annotated[
+        float | None, typer.Option(help="End after so many seconds of the episode.")
+    ] = None,
+) -> None:
+    """Watch one episode: agents, thrusters, sensing, tubes, goals, collisions."""
+    from lagros_benchmarks.cli import fail
+    from lagros_benchmarks.playback import Playback, WatchSettings
+
+    # A policy of the user's own, module:Class, lies in the folder that lagros is run from.
+    sys.path.insert(0, os.getcwd())
+    try:
+        settings = WatchSettings(
+            task=task,
+            policy=policy,
+            agents=agents,
+            preset=preset,
+            disturbance=disturbance,
+            bound=bound,
+            seed=seed,
+            scenario=scenario,
+            safety_filter=safety_filter,
+            video=video,
+            speed=speed,
+            seconds=seconds,
+        )
+        playback = Playback(settings)
+    except (ValueError, OSError) as error:
+        fail(error)
+    except ImportError as error:
+        fail(error, status=1)
+    try:
+        written = playback.play()
+    except KeyboardInterrupt:
+        raise typer.Exit from None
+    except (ImportError, OSError) as error:
+        fail(error, status=1)
+    except Exception as error:
+        # Whatever a policy raises in its episode.
+        fail(f"{type(error).__name__}: {error}", status=1)
+    finally:
+        playback.close()
+    for line in playback.summary():
+        typer.echo(line)
+    if written is not None:
+        size = written.stat().st_size / 1e6
+        typer.echo(f"wrote {written} ({playback.frames} frames, {size:.1f} MB)")
