@@ -20,6 +20,8 @@ PolicyState = Any
 # Policies of the cart-pole, and of the spacecraft.
 NAMES = ("learned", "tube-mpc", "lagros", "lqr", "random", "ppo")
 SPACECRAFT_NAMES = ("learned", "tube-mpc", "lagros", "centralized")
+# Those that prepare their margins for a bound of the disturbance.
+PREPARED = ("tube-mpc", "centralized")
 
 
 @runtime_checkable
@@ -58,7 +60,7 @@ def make(name: str, env: Any, **settings: Any) -> Policy:
             own that is built with the task's settings. A zip of stable-baselines3 holds pickled
             code and a module is code: both run, so name only what you trust.
         env: A Gymnasium or PettingZoo environment of this package; the policy takes its task
-            settings (and preset) and nothing else.
+            settings (and preset, and the bound of its disturbance) and nothing else.
         settings: Passed to the policy, e.g. `weights=path` or `metric=...`.
 
     Returns:
@@ -73,6 +75,8 @@ def make(name: str, env: Any, **settings: Any) -> Policy:
         names: tuple[str, ...] = SPACECRAFT_NAMES
         builders = _spacecraft_builders
         settings = {"preset": env.unwrapped.preset, **settings}
+        if name in PREPARED:
+            settings = {"disturbance_bound": env.unwrapped.disturbance.bound, **settings}
     elif isinstance(task, CartPoleSettings):
         names, builders = NAMES, _cartpole_builders
     else:

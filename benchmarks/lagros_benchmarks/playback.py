@@ -26,8 +26,6 @@ TASKS = ("cartpole", "spacecraft")
 BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
 # "worst" needs a metric and a plan, which not every policy has.
 WATCHED_KINDS = tuple(kind for kind in KINDS if kind != "worst")
-# Policies whose plans keep a margin for the disturbance bound.
-_PREPARED = ("tube-mpc", "centralized")
 _USE_VIDEO = "write a file with --video out.gif"
 _PAUSE = 1.5  # The last frame stays so long [s of the video].
 
@@ -266,8 +264,7 @@ class _SpacecraftGame:
             disturbance_bound=bound,
             render_mode=render_mode,
         )
-        prepared = {"disturbance_bound": bound} if settings.policy in _PREPARED else {}
-        self._planner: Any = lagros_policies.make(settings.policy, self.env, **prepared)
+        self._planner: Any = lagros_policies.make(settings.policy, self.env)
         self._policy: Any = self._planner
         if settings.safety_filter:
             self._policy = library.make_filter(self._planner, self.env, bound)

@@ -38,7 +38,8 @@ _RELABELLED = "relabelled"
 
 
 def _rounds() -> tuple[FlightSettings, ...]:
-    return tuple(FlightSettings(worlds=200, replan_period=2.0, seed=seed) for seed in (11, 12, 13))
+    seeds = range(11, 16)
+    return tuple(FlightSettings(worlds=200, replan_period=2.0, seed=seed) for seed in seeds)
 
 
 @dataclass(frozen=True)

@@ -26,11 +26,9 @@ from lagros_benchmarks.spacecraft_timing import PLAN_WORLDS, Timing, time_plans,
 from lagros_benchmarks.workers import Progress
 from lagros_envs.scenarios import Scenario
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_policies.policy import PREPARED
 
 Value = TypeVar("Value")
-
-# Policies that prepare for a disturbance bound, which they are told.
-_TOLD_THE_BOUND = ("tube-mpc", "centralized")
 
 
 @dataclass(frozen=True)
@@ -132,7 +130,7 @@ class SpacecraftExperiment:
     def policy(self, case: Case, env: SpacecraftVectorEnv) -> Policy:
         """Build the policy of a case, with its filter."""
         name, bound = case.policy, case.condition.bound
-        told = {"disturbance_bound": bound} if name in _TOLD_THE_BOUND else {}
+        told = {"disturbance_bound": bound} if name in PREPARED else {}
         settings = {**told, **self.settings.policy_settings.get(name, {})}
         policy = self.toolbox.make_policy(name, env, settings)
         return self.toolbox.make_filter(policy, env, bound) if case.safety_filter else policy

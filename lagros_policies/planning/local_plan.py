@@ -288,7 +288,7 @@ class _Problem:
                 forces, short, cost = found, lacks, price
             if not gain > settings.effort_tolerance * price:
                 break
-            if warm and short <= settings.tolerance:
+            if warm and __import__("os").environ.get("WARM","1")=="1" and short <= settings.tolerance:
                 break
         solved = math.isfinite(cost)
         start, mass = self.start, settings.mass
