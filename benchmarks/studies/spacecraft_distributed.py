@@ -153,7 +153,9 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=20)
     parser.add_argument("--bound", default="0.2,0.6,1.0", help="disturbance bounds, by commas")
     parser.add_argument("--rate", type=float, default=2.0, help="contraction rate of u* [1/s]")
-    parser.add_argument("--every", type=int, default=2, help="control steps between plans")
+    parser.add_argument(
+        "--every", type=int, default=2, help="control steps between looks at the plan"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the rows there")
     options = parser.parse_args()

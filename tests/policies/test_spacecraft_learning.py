@@ -221,3 +221,14 @@ def test_expert_and_training_settings_are_checked():
         SpacecraftExpertSettings(cruise_speed=0.0)
     with pytest.raises(ValueError, match="element"):
         DeepSetTraining(element=())
+
+
+def test_an_input_that_never_varied_does_not_count(tmp_path):
+    samples = random_samples(300, 6)
+    samples.features.obstacles[:, 7] = 0.75  # bodies of one size, say
+    network = fit_deep_set(samples, DeepSetTraining((8,), (8,), 1), tmp_path / "c")
+    before = network(samples.features)
+    samples.features.obstacles[:, 7] = 0.5
+    np.testing.assert_allclose(network(samples.features), before, atol=1e-6)
+    samples.features.obstacles[:, 2] += 0.5  # an input that did vary does count
+    assert np.abs(network(samples.features) - before).max() > 1e-3
