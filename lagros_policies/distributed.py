@@ -100,7 +100,9 @@ class DistributedTubeMpcPolicy:
             effort.
         turning_rate: alpha of the heading, which no goal asks for [1/s].
         margin: Room beyond touching that plans ask for [m]; None takes it from the bound.
-        replan_every: Control steps between plans.
+        replan_every: Control steps between looks at the plan in force: it is kept if it still
+            keeps all distances to what is sensed by then, and renewed if not.
+        kept_for: A plan older than this is renewed though it holds [s]; 0 renews it at every look.
         smoothing: Time constant of the filter of neighbours' positions and velocities [s].
         planner: The planner; its mass must be that of the task.
 
@@ -121,6 +123,7 @@ class DistributedTubeMpcPolicy:
         turning_rate: float = 0.3,
         margin: float | None = None,
         replan_every: int = 2,
+        kept_for: float = 0.7,
         smoothing: float = 0.7,
         planner: LocalPlannerSettings | None = None,
     ) -> None:
@@ -137,8 +140,9 @@ class DistributedTubeMpcPolicy:
             raise ValueError(f"margin={margin!r} must be finite and >= 0, or None")
         if replan_every < 1:
             raise ValueError(f"replan_every={replan_every!r} must be at least 1 control step")
-        if not 0.0 <= smoothing < np.inf:
-            raise ValueError(f"smoothing={smoothing!r} must be finite and >= 0")
+        for name, time in (("kept_for", kept_for), ("smoothing", smoothing)):
+            if not 0.0 <= time < np.inf:
+                raise ValueError(f"{name}={time!r} must be finite and >= 0")
         body, period = self.settings.system, self.settings.control_period
         self.tracking = WrenchTracking(
             body, design_axis(contraction_rate, period), design_axis(turning_rate, period)
@@ -146,7 +150,7 @@ class DistributedTubeMpcPolicy:
         if margin is None:
             margin = max(_LEAST_MARGIN, expected_margin(disturbance_bound, contraction_rate))
         self.margin = margin
-        self.replan_every, self.smoothing = replan_every, smoothing
+        self.replan_every, self.kept_for, self.smoothing = replan_every, kept_for, smoothing
         self.still = _STILL + _STILL_NOISE * disturbance_bound
         planner = planner or LocalPlannerSettings(mass=body.mass)
         if planner.mass != body.mass:
@@ -154,10 +158,6 @@ class DistributedTubeMpcPolicy:
                 f"the planner is for mass={planner.mass!r}; the task has {body.mass!r}"
             )
         self.planner = LocalPlanner(planner)
-        import os
-        global _KEPT_FOR, _FRESH_EVERY
-        _KEPT_FOR = float(os.environ.get("KF", "2.0")); self.kept_short=float(os.environ.get("KS","0.02"))
-        _FRESH_EVERY = int(os.environ.get("FE","5"))
 
     def predict(
         self,
@@ -208,10 +208,11 @@ class DistributedTubeMpcPolicy:
     def counters(self, state: PolicyState) -> dict[str, int]:
         """Return what happened, added up over the agents of a state.
 
-        `plans` were asked for; `failed_plans` fell short of a distance or were not found; `stuck`
-        agents are stuck now; `stuck_steps` are the control steps that agents spent stuck.
+        `plans` were asked for; `confirmed_plans` are the times that one still held and was kept;
+        `failed_plans` fell short of a distance or were not found; `stuck` agents are stuck now;
+        `stuck_steps` are the control steps that agents spent stuck.
         """
-        names = ("plans", "failed_plans", "stuck", "stuck_steps")
+        names = ("plans", "confirmed_plans", "failed_plans", "stuck", "stuck_steps")
         return {name: sum(int(getattr(memory, name)) for memory in state) for name in names}
 
     def _follow(
@@ -264,16 +265,14 @@ class DistributedTubeMpcPolicy:
         left = self.settings.horizon - now
         discs = self._discs(memory.map)
         memory.unchecked = 0
-        if plan is not None and elapsed < _KEPT_FOR and plan.short <= self.kept_short:
+        if plan is not None and elapsed < self.kept_for - 1e-9:
             short = self.planner.shortfall(plan, elapsed, np.zeros(2), discs, left)
-            if short <= self.kept_short:
+            if short <= self.planner.settings.tolerance:
                 memory.confirmed_plans += 1
                 return
         self._renew(own, left, discs, memory)
 
-    def _renew(
-        self, own: FloatArray, left: float, discs: Discs, memory: DistributedState
-    ) -> None:
+    def _renew(self, own: FloatArray, left: float, discs: Discs, memory: DistributedState) -> None:
         """Plan from the nominal state, or from the sensed one at first."""
         last, elapsed = memory.plan, memory.age * self.settings.control_period
         start = own

@@ -45,6 +45,10 @@ class SpacecraftExpertSettings:
         cruise_speed: ... nor sooner than at this mean speed on the straight line [m/s]: who is late
             arrives late, and does not rush.
 
+        side_preference: Share by which a new plan finds going counter-clockwise around an obstacle
+            cheaper. Where an agent has come to rest before one, labels that go left now and right
+            then add up to nothing.
+
     Raises:
         ValueError: A value is not positive and finite.
     """
@@ -55,6 +59,7 @@ class SpacecraftExpertSettings:
     start_weight: float = 1.0
     least_time: float = 2.0
     cruise_speed: float = 0.2
+    side_preference: float = 0.03
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -97,6 +102,7 @@ class SpacecraftExpert:
             restarts=1,
             searches=1,
             scp=replace(first.scp, effort_tolerance=_EFFORT_TOLERANCE),
+            grid=replace(first.grid, preference=settings.side_preference),
         )
         self.planners = SpacecraftPlanner(first), SpacecraftPlanner(again)
         worlds, agents = len(scenarios), scenarios[0].num_agents

@@ -40,12 +40,12 @@ _RELABELLED = "relabelled"
 
 def _rounds() -> tuple[FlightSettings, ...]:
     first = FlightSettings(worlds=200, replan_period=2.0)
-    # What remains after four rounds are collisions under strong disturbance: the last ones ask for
-    # more room, and for u* rather than the plan to correct a speed.
-    wider = SpacecraftExpertSettings(margin=0.4, start_weight=0.5)
+    # What remains after four rounds are agents that rest before an obstacle: the last round says
+    # which side to take, and asks u* rather than the plan for the speed.
+    decided = SpacecraftExpertSettings(start_weight=0.5, side_preference=0.25)
     return (
         *(replace(first, seed=seed) for seed in (11, 12, 13, 14)),
-        *(replace(first, seed=seed, expert=wider) for seed in (15, 16)),
+        replace(first, worlds=300, seed=15, expert=decided),
     )
 
 
@@ -76,7 +76,7 @@ class SpacecraftReproduceSettings:
     relabelled_weight: int = 3
     held_out: float = 0.1
     intermediate: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=4))
-    lagros: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=12))
+    lagros: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=8))
     learned: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=8))
     worlds: int = 20
     bounds: tuple[float, ...] = BOUNDS

@@ -11,6 +11,12 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
+# Distances are planned wider by this, so that they are kept between the instants too [m].
+_SPARE = 0.01
+# Room that even a body which covers the goal keeps beyond touching [m].
+_LEAST_ROOM = 0.02
+
+
 @dataclass(frozen=True)
 class Discs:
     """What to keep away from.
@@ -38,6 +44,16 @@ class Discs:
         """Return the centres at times (k,) [s] from now, shape (k, m, 2) [m]."""
         value: FloatArray = self.centres + times[:, None, None] * self.velocities
         return value
+
+    def heeded(self, times: FloatArray, foresight: float) -> BoolArray:
+        """Return which are heeded at which times (k,) [s], shape (k, m).
+
+        Those that move are heeded as far as the foresight [s]; the first and the last instant are
+        given, so that nothing can be asked for there.
+        """
+        heeded: BoolArray = (times[:, None] <= foresight + 1e-9) | ~self.moving
+        heeded[0] = heeded[-1] = False
+        return heeded
 
 
 @dataclass(frozen=True)
@@ -102,3 +118,43 @@ def responses(edges: FloatArray, times: FloatArray, mass: float) -> tuple[FloatA
     place = square[:, :-1] - square[:, 1:]
     speed = (since[:, :-1] - since[:, 1:]) / mass
     return place, speed
+
+
+def required_distances(
+    discs: Discs,
+    times: FloatArray,
+    start: FloatArray,
+    goal: FloatArray,
+    left: float,
+    margin_growth: float,
+) -> FloatArray:
+    """Return the distances that a motion has to keep: less near ends that lack room.
+
+    Args:
+        discs: What it keeps away from, m of them.
+        times: Instants from now, shape (k,) [s].
+        start: Where it is now, shape (2,) [m].
+        goal: Where it ends, shape (2,) [m].
+        left: Time until it should have arrived [s].
+        margin_growth: The acceleration at which a margin grows that there is no room for [m/s^2].
+
+    Returns:
+        Shape (k, m) [m].
+    """
+    growth = 0.5 * margin_growth
+    full = discs.touching + discs.margins + _SPARE
+    gap = lengths(start - discs.centres)
+    required = np.minimum(full, gap + growth * times[:, None] ** 2)
+    # A body may cover the margin of the goal. One that moves is left time to be gone.
+    room = np.maximum(lengths(goal - discs.centres), discs.touching + _LEAST_ROOM)
+    room = np.where(discs.moving & (left > 0.0), np.inf, room)
+    remaining = np.maximum(left - times, 0.0)
+    value: FloatArray = np.minimum(required, room + growth * remaining[:, None] ** 2)
+    return value
+
+
+def lengths(vectors: FloatArray) -> FloatArray:
+    """Return the lengths (...) of vectors (..., 2); several times as fast as NumPy's norm."""
+    x, y = vectors[..., 0], vectors[..., 1]
+    value: FloatArray = np.sqrt(x * x + y * y)
+    return value

@@ -26,18 +26,20 @@ from numpy.typing import NDArray
 
 from lagros_policies.planning.grid_path import walk
 from lagros_policies.planning.local_guess import pass_aside, progress, way_around
-from lagros_policies.planning.local_motion import Discs, LocalPlan, responses
+from lagros_policies.planning.local_motion import (
+    Discs,
+    LocalPlan,
+    lengths,
+    required_distances,
+    responses,
+)
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _UNBOUNDED = 1e30
-# Distances are planned wider by this, so that they are kept between the instants too [m].
-_SPARE = 0.01
 # Instants where distances are imposed: at most this far apart, near and far ahead [s].
 _NEAR_INSTANTS, _FAR_INSTANTS = 0.25, 0.5
-# Room that even a body which covers the goal keeps beyond touching [m].
-_LEAST_ROOM = 0.02
 # An agent that lets others go first waits for this share of the foresight.
 _PAUSE = 0.7
 # Instants at which a plan in force is checked are at most this far apart [s].
@@ -198,9 +200,9 @@ class LocalPlanner:
         ends = max(plan.duration - elapsed, settings.foresight)
         times = np.linspace(0.0, ends, math.ceil(ends / _CHECK_SPACING) + 1)
         places = plan.at(times + elapsed)[0]
-        required = _required(settings, times, places[0], goal, discs, left)
-        apart = _lengths(places[:, None] - discs.at(times))
-        heeded = _heeded(settings, times, discs)
+        required = required_distances(discs, times, places[0], goal, left, settings.margin_growth)
+        apart = lengths(places[:, None] - discs.at(times))
+        heeded = discs.heeded(times, settings.foresight)
         return float(np.max(np.where(heeded, required - apart, 0.0), initial=0.0))
 
 
@@ -231,8 +233,10 @@ class _Problem:
         self.speed = self.speed[:-1]
         self.free = start[:2] + self.times[:, None] * start[2:]
         self.discs_at = discs.at(self.times)
-        self.heeded = _heeded(settings, self.times, discs)
-        self.required = _required(settings, self.times, start[:2], goal, discs, left)
+        self.heeded = discs.heeded(self.times, settings.foresight)
+        self.required = required_distances(
+            discs, self.times, start[:2], goal, left, settings.margin_growth
+        )
         self.limit = np.maximum(settings.speed_limit, np.abs(start[2:]))
 
     def ways(self) -> Iterator[FloatArray]:
@@ -288,7 +292,7 @@ class _Problem:
                 forces, short, cost = found, lacks, price
             if not gain > settings.effort_tolerance * price:
                 break
-            if warm and __import__("os").environ.get("WARM","1")=="1" and short <= settings.tolerance:
+            if warm and short <= settings.tolerance:
                 break
         solved = math.isfinite(cost)
         start, mass = self.start, settings.mass
@@ -297,7 +301,7 @@ class _Problem:
     def _judge(self, forces: FloatArray, places: FloatArray) -> tuple[float, float]:
         """Return the largest shortfall and the cost of a motion."""
         settings = self.settings
-        apart = _lengths(places[:, None] - self.discs_at)
+        apart = lengths(places[:, None] - self.discs_at)
         short = np.where(self.heeded, np.maximum(self.required - apart, 0.0), 0.0)
         price = settings.penalty * short + 0.5 * settings.quadratic_penalty * short**2
         effort = 0.5 * float(self.lengths @ np.sum(forces**2, axis=1))
@@ -307,7 +311,7 @@ class _Problem:
         """Solve the quadratic program around positions (K, 2); None if the solver failed."""
         settings, steps = self.settings, len(self.lengths)
         delta = places[:, None] - self.discs_at
-        apart = _lengths(delta)
+        apart = lengths(delta)
         reach = np.where(self.node, settings.reach, 0.5 * settings.reach)
         room = np.where(self.heeded, apart - self.required - reach[:, None], np.inf)
         instant, disc = np.nonzero(room < 0.0)
@@ -354,9 +358,7 @@ class _Problem:
         return equality, target
 
 
-def _instants(
-    edges: FloatArray, settings: LocalPlannerSettings
-) -> tuple[FloatArray, BoolArray]:
+def _instants(edges: FloatArray, settings: LocalPlannerSettings) -> tuple[FloatArray, BoolArray]:
     """Return where distances are looked at, (K,) [s], and which of them are nodes."""
     parts = []
     # Steps are alike before the foresight, and after it.
@@ -370,41 +372,6 @@ def _instants(
         parts.append(np.tile(share == 0.0, len(some) - 1))
     times = np.concatenate([parts[0], parts[2], edges[-1:]])
     return times, np.concatenate([parts[1], parts[3], [True]])
-
-
-def _heeded(settings: LocalPlannerSettings, times: FloatArray, discs: Discs) -> BoolArray:
-    """Return which discs are heeded when, (K, m); nothing can be imposed at the given ends."""
-    heeded: BoolArray = (times[:, None] <= settings.foresight + 1e-9) | ~discs.moving
-    heeded[0] = heeded[-1] = False
-    return heeded
-
-
-def _required(
-    settings: LocalPlannerSettings,
-    times: FloatArray,
-    start: FloatArray,
-    goal: FloatArray,
-    discs: Discs,
-    left: float,
-) -> FloatArray:
-    """Return the distances to keep, (K, m): less near ends that lack room."""
-    growth = 0.5 * settings.margin_growth
-    full = discs.touching + discs.margins + _SPARE
-    gap = _lengths(start - discs.centres)
-    required = np.minimum(full, gap + growth * times[:, None] ** 2)
-    # A body may cover the margin of the goal. One that moves is left time to be gone.
-    room = np.maximum(_lengths(goal - discs.centres), discs.touching + _LEAST_ROOM)
-    room = np.where(discs.moving & (left > 0.0), np.inf, room)
-    remaining = np.maximum(left - times, 0.0)
-    value: FloatArray = np.minimum(required, room + growth * remaining[:, None] ** 2)
-    return value
-
-
-def _lengths(vectors: FloatArray) -> FloatArray:
-    """Return the lengths (...) of vectors (..., 2); several times as fast as `norm`."""
-    x, y = vectors[..., 0], vectors[..., 1]
-    value: FloatArray = np.sqrt(x * x + y * y)
-    return value
 
 
 def _solve(
