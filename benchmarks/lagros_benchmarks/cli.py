@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
 
+from lagros_benchmarks.data import data
 from lagros_benchmarks.watch import watch
 
 if TYPE_CHECKING:
@@ -261,6 +262,7 @@ def _reproduced(task: str, folder: Path) -> Outputs:
 
 
 app.command()(watch)
+app.add_typer(data, name="data")
 
 
 def progress_line(line: str) -> None:
