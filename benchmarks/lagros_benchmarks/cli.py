@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 import typer
 
 from lagros_benchmarks.data import data
+from lagros_benchmarks.export import export
 from lagros_benchmarks.watch import watch
 
 if TYPE_CHECKING:
@@ -262,6 +263,7 @@ def _reproduced(task: str, folder: Path) -> Outputs:
 
 
 app.command()(watch)
+app.command()(export)
 app.add_typer(data, name="data")
 
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _WIDE_RANGE = 12.0  # of efforts, from which their axis is logarithmic
+_NARROWEST = 7.2  # so that the legend of four policies fits [inch]
 
 
 class _Measure(NamedTuple):
@@ -70,7 +71,7 @@ def draw(rows: Sequence[Row], path: str | Path) -> Path:
 
 def _bound_figure(rows: Sequence[Row], path: Path) -> Path:
     columns = _columns(rows, ("disturbance", "safety_filter"))
-    figure, panels = canvas(3.1 * len(columns) + 0.9, 5.0, 2, len(columns), "row")
+    figure, panels = canvas(max(_NARROWEST, 3.1 * len(columns) + 0.9), 5.0, 2, len(columns), "row")
     for index, (title, part) in enumerate(columns):
         success, effort = panels[index], panels[index + len(columns)]
         success.set_title(title, loc="left", fontsize=10)
@@ -98,7 +99,7 @@ def _bound_figure(rows: Sequence[Row], path: Path) -> Path:
 
 def _scale_figure(rows: Sequence[Row], path: Path) -> Path:
     columns = _columns(rows, ("disturbance", "bound", "safety_filter"))
-    figure, panels = canvas(3.1 * len(columns) + 0.9, 5.0, 2, len(columns), "row")
+    figure, panels = canvas(max(_NARROWEST, 3.1 * len(columns) + 0.9), 5.0, 2, len(columns), "row")
     counts = sorted({row["agents"] for row in rows})
     for index, (title, part) in enumerate(columns):
         success, time = panels[index], panels[index + len(columns)]

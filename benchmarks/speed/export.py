@@ -1,0 +1,138 @@
+"""The exported C file against NumPy, in one run: python benchmarks/speed/export.py.
+
+Options: --policy NAME --rounds N --json FILE. Prints, for each way to compile, the time of one
+call, how many times as fast as `predict` and as the bare network in NumPy that is, and the bytes of
+code, weights, data and stack. Everything takes turns on one thread. Times are medians of processor
+time, so that other processes on the machine count little; the wall clock stands beside them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+# The libraries read it when they are loaded.
+os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
+HERE = Path(__file__).resolve().parent
+sys.path[:] = [str(HERE.parent), *(entry for entry in sys.path if entry != str(HERE))]
+
+import numpy as np  # noqa: E402
+
+from lagros_envs.files import write_atomic  # noqa: E402
+from lagros_policies.export import NAMES, check, load_source  # noqa: E402
+from lagros_policies.export.c99 import TANHS, c_source  # noqa: E402
+from lagros_policies.export.source import example_observations  # noqa: E402
+from lagros_policies.imitation.features import cartpole_features  # noqa: E402
+from speed.timing import Candidate, interleave  # noqa: E402
+
+# The first is what runs anywhere. C99 mode keeps products and sums apart; the last fuses them.
+BUILDS = (
+    ("-std=c99", "-O2"),
+    ("-std=c99", "-O3"),
+    ("-std=c99", "-O3", "-march=native", "-ffp-contract=fast"),
+)
+CALLS = 100  # of each candidate in a round, on different observations
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description="Time an exported C file against NumPy.")
+    parser.add_argument("--policy", default="lagros-cartpole", choices=NAMES)
+    parser.add_argument("--rounds", type=int, default=200)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    source = load_source(options.policy)
+    rows = example_observations(CALLS)
+    features = cartpole_features(rows)[0]
+
+    def predict(_: int) -> None:
+        for row in rows:
+            source.policy.predict(row)
+
+    def bare(_: int) -> None:
+        for row in features:
+            source.network(row)
+
+    candidates: dict[str, Candidate] = {"NumPy predict": predict, "NumPy bare network": bare}
+    sizes: dict[str, dict[str, int]] = {}
+    for tanh in TANHS:
+        text = c_source(source, tanh)  # type: ignore[arg-type]
+        for flags in BUILDS:
+            name = f"C, tanh {tanh}, {' '.join(flags[1:])}"
+            with check.CompiledPolicy(text, source, flags) as compiled:
+                found = check.agreement(compiled.force(rows), source, rows)
+                if not found.relative < 1e-5:
+                    raise RuntimeError(f"{name} differs from NumPy by {found}")
+                candidates[name] = lambda _, policy=compiled: policy.force(rows)
+            sizes[name] = footprint(text, flags)
+    times = interleave(candidates, options.rounds)
+    cpu = {name: np.asarray(taken.cpu_seconds) / CALLS for name, taken in times.items()}
+    results: list[dict[str, Any]] = []
+    for name, seconds in cpu.items():
+        ratios = [float(np.median(cpu[peer] / seconds)) for peer in list(cpu)[:2]]
+        figures = {
+            "name": name,
+            "ns_per_call": float(1e9 * np.median(seconds)),
+            "wall_ns_per_call": 1e9 * times[name].median / CALLS,
+            "times_as_fast_as_predict": ratios[0],
+            "times_as_fast_as_bare": ratios[1],
+        }
+        results.append(figures | sizes.get(name, {}))
+    report(results, options.policy)
+    if options.json:
+        write_atomic(options.json, json.dumps(results, indent=1) + "\n")
+
+
+def report(results: list[dict[str, Any]], policy: str) -> None:
+    """Print the table."""
+    version = subprocess.run(
+        [check.compiler() or "gcc", "--version"], capture_output=True, text=True, check=True
+    ).stdout.splitlines()[0]
+    print(f"{policy}, one call, one thread; {version}; NumPy {np.__version__}")
+    print(f"load {os.getloadavg()[0]:.1f}. Ratios: how many times as fast as NumPy's.\n")
+    print(f"{'':<52}{'ns':>7}{'wall':>7}{'predict':>9}{'bare':>7}{'text':>8}{'RAM':>5}{'stack':>7}")
+    for row in results:
+        memory = (
+            f"{row['text']:>8}{row['data'] + row['bss']:>5}{row['stack']:>7}"
+            if "text" in row
+            else ""
+        )
+        print(
+            f"{row['name']:<52}{row['ns_per_call']:>7.0f}{row['wall_ns_per_call']:>7.0f}"
+            f"{row['times_as_fast_as_predict']:>9.1f}{row['times_as_fast_as_bare']:>7.1f}{memory}"
+        )
+    print("\ntext: code and weights, of `size` [B]. RAM: data and bss [B]. stack: at most [B].")
+
+
+def footprint(text: str, flags: tuple[str, ...]) -> dict[str, int]:
+    """Return the bytes of text (code and constants), data, bss and, at most, stack.
+
+    Raises:
+        FileNotFoundError: There is no compiler or no `size`.
+    """
+    tool, size = check.compiler(), shutil.which("size")
+    if tool is None or size is None:
+        raise FileNotFoundError("needs gcc and size (binutils) on the path")
+    with tempfile.TemporaryDirectory() as folder:
+        code, built = Path(folder) / "policy.c", Path(folder) / "policy.o"
+        code.write_text(text)
+        subprocess.run(
+            [tool, *flags, "-fstack-usage", "-c", str(code), "-o", str(built)], check=True
+        )
+        done = subprocess.run([size, str(built)], capture_output=True, text=True, check=True)
+        numbers = [int(word) for word in done.stdout.splitlines()[1].split()[:3]]
+        usage = built.with_suffix(".su").read_text().splitlines()
+        # Sum of all functions: what a call could need were none inlined into another.
+        stack = sum(int(line.split("\t")[1]) for line in usage)
+    return dict(zip(("text", "data", "bss"), numbers, strict=True)) | {"stack": stack}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""`lagros export`: what it writes, what it says, what it refuses to write."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from lagros_benchmarks import cli
+from lagros_policies.export import check, load_source
+from lagros_policies.export.source import example_observations
+from lagros_policies.imitation.networks import Mlp
+
+
+@pytest.fixture
+def invoke(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return lambda *arguments: CliRunner().invoke(cli.app, ("export", *arguments))
+
+
+@pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
+def test_c_is_written_under_the_name_of_the_policy(invoke, tmp_path):
+    result = invoke("learned-cartpole", "--tanh", "rational")
+    assert result.exit_code == 0, result.output
+    assert "wrote learned_cartpole.c" in result.stdout
+    assert "differs from NumPy, over 1000 observations, by at most" in result.stdout
+    source = load_source("learned-cartpole")
+    assert source.digest in result.stdout
+    text = (tmp_path / "learned_cartpole.c").read_text()
+    assert "rational_tanh" in text
+    rows = example_observations(50)
+    with check.CompiledPolicy(text, source) as compiled:
+        np.testing.assert_allclose(compiled.force(rows), source.force(rows), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.skipif(not check.has_onnxruntime(), reason="no onnxruntime")
+def test_onnx_of_own_weights_is_written_where_asked(invoke, tmp_path):
+    rng = np.random.default_rng(0)
+    Mlp(
+        [rng.standard_normal((7, 9)), rng.standard_normal((9, 1))],
+        [rng.standard_normal(9), rng.standard_normal(1)],
+    ).save(tmp_path / "own.safetensors")
+    result = invoke(
+        "lagros-cartpole", "--format", "onnx", "--weights", "own.safetensors", "--out", "a/b.onnx"
+    )
+    assert result.exit_code == 0, result.output
+    source = load_source("lagros-cartpole", tmp_path / "own.safetensors")
+    rows = example_observations(50)
+    forces = check.onnx_force((tmp_path / "a" / "b.onnx").read_bytes(), rows)
+    np.testing.assert_allclose(forces, source.force(rows), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["c", "onnx"])
+def test_what_cannot_be_compared_is_written_and_said(invoke, tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(check, "compiler", lambda: None)
+    monkeypatch.setattr(check, "has_onnxruntime", lambda: False)
+    result = invoke("lagros-cartpole", "--format", kind)
+    assert result.exit_code == 0, result.output
+    assert "not compared with NumPy: " in result.stdout
+    assert (tmp_path / f"lagros_cartpole.{kind}").is_file()
+
+
+@pytest.mark.parametrize("difference", [1.0, float("nan")])
+def test_a_file_that_disagrees_is_not_written(invoke, tmp_path, monkeypatch, difference):
+    monkeypatch.setattr(check, "compiler", lambda: "gcc")
+    monkeypatch.setattr(check, "check_c", lambda *_: check.Agreement(difference, 30.0))
+    result = invoke("lagros-cartpole")
+    assert result.exit_code == 1
+    assert "not written" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("lqr",), "choose one of lagros-cartpole, learned-cartpole"),
+        (("lagros-cartpole", "--format", "h"), "--format: 'h' must be one of c, onnx"),
+        (("lagros-cartpole", "--tanh", "fast"), "--tanh: 'fast' must be one of libm, rational"),
+        (("lagros-cartpole", "--format", "onnx", "--tanh", "rational"), "leave it out for onnx"),
+        (("lagros-cartpole", "--weights", "none.safetensors"), "no weight file"),
+    ],
+)
+def test_a_mistake_is_explained_with_status_2_and_no_traceback(invoke, arguments, message):
+    result = invoke(*arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert "Traceback" not in result.output

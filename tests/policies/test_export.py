@@ -1,0 +1,196 @@
+"""Exported files: C compiled by gcc and ONNX by ONNX Runtime, against NumPy and float64."""
+
+import hashlib
+import itertools
+import subprocess
+
+import numpy as np
+import pytest
+
+from lagros_envs import cartpole_task as task
+from lagros_policies.export import NAMES, check, load_source
+from lagros_policies.export.c99 import TANH_ERROR, TANHS, c_source
+from lagros_policies.export.onnx import network_model, policy_model
+from lagros_policies.export.source import example_observations
+from lagros_policies.imitation.network_policy import PRETRAINED
+from lagros_policies.imitation.networks import Mlp
+
+needs_compiler = pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
+needs_onnx = pytest.mark.skipif(not check.has_onnxruntime(), reason="no onnxruntime")
+
+
+def by_hand(network, observation):
+    """Return u_L in float64, written from the definition of the features and not by our code."""
+    forces = []
+    for row in observation.astype(float):
+        x, goal, start, t = row[:4], row[4:8], row[8:12], row[12]
+        mirror = -1.0 if start[1] < 0 else 1.0
+        layer = np.append(
+            mirror * np.array([x[0] - goal[0], *x[1:], goal[0] - start[0], start[1]]), t
+        )
+        for index, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+            layer = layer @ weight.astype(float) + bias
+            if index < len(network.weights) - 1:
+                layer = np.tanh(layer)
+        forces.append(mirror * layer[0])
+    return np.array(forces)
+
+
+def save_network(path, widths, seed=0):
+    rng = np.random.default_rng(seed)
+    sizes = [7, *widths, 1]
+    pairs = list(itertools.pairwise(sizes))
+    weights = [2.0 * rng.standard_normal(pair) / np.sqrt(pair[0]) for pair in pairs]
+    Mlp(weights, [rng.standard_normal(pair[1]) for pair in pairs]).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def observations():
+    rows = example_observations(400)
+    # Both sides, an upright start (which is no left start), and a start away from the origin.
+    assert 100 < np.sum(rows[:, 9] < 0) < 300
+    rows[0, 9] = 0.0
+    rows[1, 9] = -0.0
+    rows[2:40, 8] = 1.5
+    return rows
+
+
+@needs_compiler
+@pytest.mark.parametrize("tanh", TANHS)
+@pytest.mark.parametrize("name", NAMES)
+def test_c_equals_numpy_and_the_definition(name, tanh, observations):
+    source = load_source(name)
+    with check.CompiledPolicy(c_source(source, tanh), source) as compiled:
+        forces = compiled.force(observations)
+    wanted = source.force(observations)
+    np.testing.assert_allclose(forces, wanted, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(forces, by_hand(source.network, observations), rtol=1e-5, atol=1e-5)
+    # The force is in newtons: the action of the task times its scale.
+    settings = task.CartPoleSettings()
+    action, _ = type(source.policy)(settings).predict(observations)
+    np.testing.assert_allclose(forces, settings.force_scale * action[:, 0], rtol=1e-5, atol=1e-5)
+
+
+@needs_compiler
+@pytest.mark.parametrize("widths", [(), (3,), (32, 17), (13, 40, 24)])
+def test_c_of_any_network(tmp_path, widths, observations):
+    source = load_source("lagros-cartpole", save_network(tmp_path / "own.safetensors", widths))
+    wanted = by_hand(source.network, observations)
+    for tanh in TANHS:
+        with check.CompiledPolicy(c_source(source, tanh), source) as compiled:
+            forces = compiled.force(observations)
+        np.testing.assert_allclose(forces, wanted, rtol=1e-5, atol=1e-5)
+
+
+@needs_compiler
+@pytest.mark.parametrize("tanh", TANHS)
+def test_the_self_test_passes_and_can_fail(tmp_path, tanh):
+    source = load_source("learned-cartpole")
+    text = c_source(source, tanh)
+    spoiled = text.replace("features[6] = time;", "features[6] = time + 0.01f;")
+    assert spoiled != text
+    for case, status in ((text, 0), (spoiled, 1)):
+        code, program = tmp_path / "policy.c", tmp_path / "policy"
+        code.write_text(case)
+        flags = [*check.STRICT, "-Wmissing-prototypes", "-Wconversion", "-DLAGROS_SELF_TEST"]
+        command = [check.compiler(), *flags, str(code), "-o", str(program), "-lm"]
+        subprocess.run(command, check=True)
+        done = subprocess.run([program], capture_output=True, text=True, check=False)
+        assert done.returncode == status
+        assert ("8 of 8 cases agree" in done.stdout) == (status == 0)
+
+
+@needs_compiler
+def test_the_rational_tanh_keeps_its_stated_error(tmp_path):
+    # 0 -> tanh(v x) with one hidden unit: time is the feature that is not mirrored.
+    weight = np.zeros((7, 1))
+    weight[6] = 1.0
+    Mlp([weight, np.ones((1, 1))], [np.zeros(1), np.zeros(1)]).save(tmp_path / "tanh.safetensors")
+    source = load_source("lagros-cartpole", tmp_path / "tanh.safetensors")
+    times = np.concatenate([np.linspace(1e-6, 12.0, 200_001), 2.0 ** np.linspace(-60, 60, 50_001)])
+    rows = np.zeros((2 * len(times), 13), np.float32)
+    rows[:, 12] = np.concatenate([times, -times])
+    with check.CompiledPolicy(c_source(source, "rational"), source) as compiled:
+        values = compiled.force(rows)
+        rows[:1, 12] = np.nan
+        assert np.isnan(compiled.force(rows[:1])[0])
+    wanted = np.tanh(np.concatenate([times, -times]).astype(np.float32).astype(float))
+    assert np.max(np.abs(values / wanted - 1.0)) <= TANH_ERROR
+
+
+@needs_onnx
+@pytest.mark.parametrize("name", NAMES)
+def test_onnx_equals_numpy(name, observations):
+    source = load_source(name)
+    model = policy_model(source)
+    forces = check.onnx_force(model, observations)
+    found = check.agreement(forces, source, observations)
+    assert found.largest_force > 10.0
+    assert found.relative < 1e-6
+    # A batch of one is the same model.
+    assert check.onnx_force(model, observations[:1])[0] == pytest.approx(forces[0], rel=1e-5)
+
+
+@needs_onnx
+def test_onnx_ports_and_provenance():
+    import onnxruntime
+
+    source = load_source("lagros-cartpole")
+    session = onnxruntime.InferenceSession(policy_model(source), providers=["CPUExecutionProvider"])
+    (port,), (answer,) = session.get_inputs(), session.get_outputs()
+    assert (port.name, port.shape, port.type) == ("observation", ["batch", 13], "tensor(float)")
+    assert (answer.name, answer.shape) == ("force", ["batch", 1])
+    properties = session.get_modelmeta().custom_metadata_map
+    assert properties["weights_sha256"] == source.digest
+    assert properties["unit"] == "N"
+
+
+@needs_onnx
+def test_onnx_of_a_bare_network(tmp_path):
+    import onnxruntime
+
+    network = Mlp.load(save_network(tmp_path / "own.safetensors", (20, 10)))
+    session = onnxruntime.InferenceSession(
+        network_model(network), providers=["CPUExecutionProvider"]
+    )
+    features = np.linspace(-1.0, 1.0, 7, dtype=np.float32)
+    (value,) = session.run(["y"], {"x": features[None]})
+    np.testing.assert_allclose(value[0], network(features), rtol=1e-5, atol=1e-6)
+
+
+def test_the_provenance_is_that_of_the_file():
+    source = load_source("lagros-cartpole")
+    data = (PRETRAINED / "cartpole_lagros.safetensors").read_bytes()
+    assert source.digest == hashlib.sha256(data).hexdigest()
+    text = c_source(source)
+    assert source.digest in text
+    assert "malloc" not in text
+    assert text == c_source(source)
+
+
+def test_mistakes_are_explained(tmp_path):
+    with pytest.raises(ValueError, match="choose one of lagros-cartpole, learned-cartpole"):
+        load_source("lagros-spacecraft")
+    with pytest.raises(FileNotFoundError, match="no weight file"):
+        load_source("lagros-cartpole", tmp_path / "none.safetensors")
+    Mlp([np.ones((5, 1))], [np.ones(1)]).save(tmp_path / "five.safetensors")
+    with pytest.raises(ValueError, match="a cart-pole network has 7 and 1"):
+        load_source("lagros-cartpole", tmp_path / "five.safetensors")
+    with pytest.raises(ValueError, match="tanh='fast' must be one of libm, rational"):
+        c_source(load_source("lagros-cartpole"), "fast")
+
+
+@needs_compiler
+def test_a_file_that_does_not_compile_is_refused():
+    source = load_source("lagros-cartpole")
+    with pytest.raises(RuntimeError, match="refuses the exported file"):
+        check.CompiledPolicy(c_source(source) + "int unused(", source)
+
+
+def test_an_agreement_with_nan_is_none():
+    source = load_source("lagros-cartpole")
+    rows = example_observations(3)
+    forces = source.force(rows).copy()
+    forces[1] = np.nan
+    assert not check.agreement(forces, source, rows).relative <= 1.0
