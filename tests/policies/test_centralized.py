@@ -335,4 +335,4 @@ def test_make_builds_it_for_the_spacecraft_and_names_what_there_is():
     action, _ = policy.predict(env.state())
     assert action.shape == (2, 8)
     with pytest.raises(ValueError, match="centralized"):
-        lagros_policies.make("lagros", env)
+        lagros_policies.make("lqr", env)
