@@ -149,6 +149,8 @@ def design_axis(
     """
     from scipy.optimize import minimize_scalar
 
+    if not (math.isfinite(rate) and rate > 0.0):
+        raise ValueError(f"rate={rate!r} must be positive and finite")
     if objective == "state" and period == 0.0 and 1.0 + 2.0 * rate**2 <= stiffness_limit:
         return AxisMetric(rate, 1.0 + 2.0 * rate**2, period)
     low, high = stiffness_range(rate, period)

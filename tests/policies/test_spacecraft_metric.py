@@ -321,3 +321,9 @@ def test_on_the_plan_nothing_is_added():
 def test_wrong_values_are_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan")])
+def test_a_metric_needs_a_positive_rate(rate):
+    with pytest.raises(ValueError, match="rate="):
+        design_axis(rate, 0.1)
