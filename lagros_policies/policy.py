@@ -17,9 +17,24 @@ Float32Array = NDArray[np.float32]
 # What a planner remembers between calls; stateless policies keep None.
 PolicyState = Any
 
-# Policies of the cart-pole, and of the spacecraft.
-NAMES = ("learned", "tube-mpc", "lagros", "lqr", "random", "ppo")
-SPACECRAFT_NAMES = ("learned", "tube-mpc", "lagros", "centralized")
+# Policies of the cart-pole, and of the spacecraft; each is imported when it is asked for, as torch,
+# solvers and learned weights are needed only then.
+_CARTPOLE = {
+    "learned": "lagros_policies.learned:LearnedPolicy",
+    "tube-mpc": "lagros_policies.tube_mpc:TubeMpcPolicy",
+    "lagros": "lagros_policies.lagros:LagrosPolicy",
+    "lqr": "lagros_policies.baselines:LqrPolicy",
+    "random": "lagros_policies.baselines:RandomPolicy",
+    "ppo": "lagros_policies.baselines:PpoPolicy",
+}
+_SPACECRAFT = {
+    "learned": "lagros_policies.learned:SpacecraftLearnedPolicy",
+    "tube-mpc": "lagros_policies.distributed:DistributedTubeMpcPolicy",
+    "lagros": "lagros_policies.lagros:SpacecraftLagrosPolicy",
+    "centralized": "lagros_policies.centralized:CentralizedPolicy",
+}
+NAMES = tuple(_CARTPOLE)
+SPACECRAFT_NAMES = tuple(_SPACECRAFT)
 # Those that prepare their margins for a bound of the disturbance.
 PREPARED = ("tube-mpc", "centralized")
 
@@ -72,33 +87,32 @@ def make(name: str, env: Any, **settings: Any) -> Policy:
     """
     task = getattr(env.unwrapped, "settings", None)
     if isinstance(task, SpacecraftSettings):
-        names: tuple[str, ...] = SPACECRAFT_NAMES
-        builders = _spacecraft_builders
+        classes = _SPACECRAFT
         settings = {"preset": env.unwrapped.preset, **settings}
         if name in PREPARED:
             settings = {"disturbance_bound": env.unwrapped.disturbance.bound, **settings}
     elif isinstance(task, CartPoleSettings):
-        names, builders = NAMES, _cartpole_builders
+        classes = _CARTPOLE
     else:
         raise TypeError(f"there are no policies for {env}; use an environment of lagros_envs")
-    if name in names:
-        return builders()[name](task, **settings)
+    if name in classes:
+        return _class_named(classes[name])(task, **settings)
     if name.endswith(".zip"):
         from lagros_policies.baselines import load_stable_baselines3
 
         algorithm, _, path = name.rpartition(":")
         return load_stable_baselines3(path, algorithm or None, **settings)
     if ":" in name:
-        return _own_policy(name)(task, **settings)
-    near = difflib.get_close_matches(name, names, n=1)
+        return _class_named(name)(task, **settings)
+    near = difflib.get_close_matches(name, classes, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     raise ValueError(
-        f"policy {name!r} is not known.{hint} Use one of {', '.join(names)}, the path of a "
+        f"policy {name!r} is not known.{hint} Use one of {', '.join(classes)}, the path of a "
         "stable-baselines3 zip, or module:Class"
     )
 
 
-def _own_policy(name: str) -> Callable[..., Policy]:
+def _class_named(name: str) -> Callable[..., Policy]:
     module, _, attribute = name.partition(":")
     try:
         return cast("Callable[..., Policy]", getattr(importlib.import_module(module), attribute))
@@ -107,34 +121,3 @@ def _own_policy(name: str) -> Callable[..., Policy]:
             f"policy {name!r}: {error}; module:Class must name a class that Python can import from "
             "here"
         ) from error
-
-
-def _cartpole_builders() -> dict[str, Callable[..., Policy]]:
-    # Imported late: torch, solvers and learned weights are needed only by whoever asks for them.
-    from lagros_policies.baselines import LqrPolicy, PpoPolicy, RandomPolicy
-    from lagros_policies.lagros import LagrosPolicy
-    from lagros_policies.learned import LearnedPolicy
-    from lagros_policies.tube_mpc import TubeMpcPolicy
-
-    return {
-        "learned": LearnedPolicy,
-        "tube-mpc": TubeMpcPolicy,
-        "lagros": LagrosPolicy,
-        "lqr": LqrPolicy,
-        "random": RandomPolicy,
-        "ppo": PpoPolicy,
-    }
-
-
-def _spacecraft_builders() -> dict[str, Callable[..., Policy]]:
-    from lagros_policies.centralized import CentralizedPolicy
-    from lagros_policies.distributed import DistributedTubeMpcPolicy
-    from lagros_policies.lagros import SpacecraftLagrosPolicy
-    from lagros_policies.learned import SpacecraftLearnedPolicy
-
-    return {
-        "learned": SpacecraftLearnedPolicy,
-        "tube-mpc": DistributedTubeMpcPolicy,
-        "lagros": SpacecraftLagrosPolicy,
-        "centralized": CentralizedPolicy,
-    }
