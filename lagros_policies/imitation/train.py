@@ -13,12 +13,13 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_policies.imitation.networks import Mlp, read_safetensors, write_safetensors
+from lagros_policies.imitation.checkpoint import load_progress, save_progress
+from lagros_policies.imitation.networks import Mlp
 
 if TYPE_CHECKING:
     import torch
@@ -152,10 +153,11 @@ class _Run:
             layers += [torch.nn.Linear(width, following), torch.nn.Tanh()]
         self.model = torch.nn.Sequential(*layers[:-1])
         self.optimiser = torch.optim.Adam(self.model.parameters(), lr=settings.learning_rate)
-        self.epoch = 0
         data = hashlib.sha256(features.tobytes() + labels.tobytes()).hexdigest()
         self._fingerprint = json.dumps({"settings": asdict(settings), "data": data})
-        self._resume()
+        self.epoch = load_progress(
+            checkpoint, list(self.model.parameters()), self.optimiser, self._fingerprint
+        )
 
     def one_epoch(self) -> float:
         """Pass once over the data and return the mean loss."""
@@ -192,36 +194,14 @@ class _Run:
         return Mlp(weights, biases)
 
     def save(self) -> None:
-        """Write model and optimiser; safetensors, so that a checkpoint holds no code."""
-        tensors: dict[str, Any] = {}
-        for index, parameter in enumerate(self.model.parameters()):
-            slots = self.optimiser.state[parameter]
-            tensors[f"{index}.value"] = parameter.detach().numpy()
-            tensors[f"{index}.mean"] = slots["exp_avg"].numpy()
-            tensors[f"{index}.square"] = slots["exp_avg_sq"].numpy()
-            tensors[f"{index}.step"] = np.array([float(slots["step"])], np.float32)
-        metadata = {"fingerprint": self._fingerprint, "epoch": str(self.epoch)}
-        write_safetensors(self.checkpoint, tensors, metadata)
-
-    def _resume(self) -> None:
-        import torch
-
-        if not self.checkpoint.exists():
-            return
-        tensors, metadata = read_safetensors(self.checkpoint)
-        if metadata.get("fingerprint") != self._fingerprint:
-            raise ValueError(
-                f"{self.checkpoint} belongs to other settings or data; remove it to start anew"
-            )
-        self.epoch = int(metadata["epoch"])
-        with torch.no_grad():
-            for index, parameter in enumerate(self.model.parameters()):
-                parameter.copy_(torch.from_numpy(tensors[f"{index}.value"]))
-                self.optimiser.state[parameter] = {
-                    "step": torch.tensor(float(tensors[f"{index}.step"][0])),
-                    "exp_avg": torch.from_numpy(tensors[f"{index}.mean"].copy()),
-                    "exp_avg_sq": torch.from_numpy(tensors[f"{index}.square"].copy()),
-                }
+        """Write model and optimiser."""
+        save_progress(
+            self.checkpoint,
+            list(self.model.parameters()),
+            self.optimiser,
+            self._fingerprint,
+            self.epoch,
+        )
 
 
 def _statistics(values: Float32Array) -> tuple[Float32Array, Float32Array]:

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_policies.imitation.checkpoint import load_progress, save_progress
 from lagros_policies.imitation.deep_set import OUTPUTS, DeepSet
-from lagros_policies.imitation.networks import read_safetensors, write_safetensors
 from lagros_policies.imitation.spacecraft_features import (
     NEIGHBOUR,
     OBSTACLE,
@@ -222,12 +222,11 @@ class _Run:
         ]
         self.parameters = [value for part in self.parts for value in part.parameters()]
         self.optimiser = torch.optim.Adam(self.parameters, lr=settings.learning_rate)
-        self.epoch = 0
         data = hashlib.sha256()
         for array in (own, neighbours, obstacles, self.target):
             data.update(np.ascontiguousarray(array).tobytes())
         self._fingerprint = json.dumps({"settings": asdict(settings), "data": data.hexdigest()})
-        self._resume()
+        self.epoch = load_progress(checkpoint, self.parameters, self.optimiser, self._fingerprint)
 
     def one_epoch(self) -> float:
         """Pass once over the data and return the mean loss."""
@@ -281,36 +280,10 @@ class _Run:
         return DeepSet(parts[0], parts[1], parts[2])
 
     def save(self) -> None:
-        """Write model and optimiser; safetensors, so that a checkpoint holds no code."""
-        tensors: dict[str, Any] = {}
-        for index, parameter in enumerate(self.parameters):
-            slots = self.optimiser.state[parameter]
-            tensors[f"{index}.value"] = parameter.detach().numpy()
-            tensors[f"{index}.mean"] = slots["exp_avg"].numpy()
-            tensors[f"{index}.square"] = slots["exp_avg_sq"].numpy()
-            tensors[f"{index}.step"] = np.array([float(slots["step"])], np.float32)
-        metadata = {"fingerprint": self._fingerprint, "epoch": str(self.epoch)}
-        write_safetensors(self.checkpoint, tensors, metadata)
-
-    def _resume(self) -> None:
-        import torch
-
-        if not self.checkpoint.exists():
-            return
-        tensors, metadata = read_safetensors(self.checkpoint)
-        if metadata.get("fingerprint") != self._fingerprint:
-            raise ValueError(
-                f"{self.checkpoint} belongs to other settings or data; remove it to start anew"
-            )
-        self.epoch = int(metadata["epoch"])
-        with torch.no_grad():
-            for index, parameter in enumerate(self.parameters):
-                parameter.copy_(torch.from_numpy(tensors[f"{index}.value"]))
-                self.optimiser.state[parameter] = {
-                    "step": torch.tensor(float(tensors[f"{index}.step"][0])),
-                    "exp_avg": torch.from_numpy(tensors[f"{index}.mean"].copy()),
-                    "exp_avg_sq": torch.from_numpy(tensors[f"{index}.square"].copy()),
-                }
+        """Write model and optimiser."""
+        save_progress(
+            self.checkpoint, self.parameters, self.optimiser, self._fingerprint, self.epoch
+        )
 
 
 def _layers(widths: list[int]) -> torch.nn.Sequential:
