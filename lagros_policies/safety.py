@@ -325,13 +325,16 @@ class SafetyFilter:
         rims[..., :2] -= states[:, :, None, :2]
         reach = self.settings.sensing_radius + rims[..., 2]
         near = (np.linalg.norm(rims[..., :2], axis=-1) <= reach) & (mask > 0.0)[:, None]
+        heading = states[..., HEADING]
+        own = (
+            goals - states[..., :2],
+            states[..., VELOCITY_X : VELOCITY_X + 2],
+            np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=-1),
+            states[..., [SPIN]],
+            np.repeat(time[:, None], n, axis=1),
+        )
         return Sensed(
-            (goals - states[..., :2]).reshape(-1, 2),
-            states[..., VELOCITY_X : VELOCITY_X + 2].reshape(-1, 2),
-            states[..., HEADING].ravel(),
-            np.zeros(worlds * n),
-            states[..., SPIN].ravel(),
-            np.repeat(time[:, 0], n),
+            np.concatenate(own, axis=-1).reshape(worlds * n, -1),
             neighbours.reshape(worlds * n, -1, 4),
             seen.reshape(worlds * n, -1),
             rims.reshape(worlds * n, -1, OBSTACLE_DIM),

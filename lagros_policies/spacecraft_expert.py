@@ -44,10 +44,9 @@ class SpacecraftExpertSettings:
         least_time: A new plan never asks for an arrival sooner than this [s] ...
         cruise_speed: ... nor sooner than at this mean speed on the straight line [m/s]: who is late
             arrives late, and does not rush.
-
-        side_preference: Share by which a new plan finds going counter-clockwise around an obstacle
-            cheaper. Where an agent has come to rest before one, labels that go left now and right
-            then add up to nothing.
+        side_preference: Share by which plans find going counter-clockwise around an obstacle
+            cheaper. Labels that go left in one world and right in the next add up to nothing, and
+            what imitates them comes to rest before the obstacle.
 
     Raises:
         ValueError: A value is not positive and finite.
@@ -56,10 +55,10 @@ class SpacecraftExpertSettings:
     margin: float = 0.3
     contraction_rate: float = 2.0
     turning_rate: float = 0.3
-    start_weight: float = 1.0
+    start_weight: float = 0.5
     least_time: float = 2.0
     cruise_speed: float = 0.2
-    side_preference: float = 0.03
+    side_preference: float = 0.25
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -93,6 +92,7 @@ class SpacecraftExpert:
             design_axis(settings.turning_rate, period),
         )
         first = planner_settings(task, settings.margin)
+        first = replace(first, grid=replace(first.grid, preference=settings.side_preference))
         # What is followed for a few steps needs no fine grid, and a plan that does not come easily
         # is left to the next turn: other labels are cheaper.
         again = replace(
@@ -102,7 +102,6 @@ class SpacecraftExpert:
             restarts=1,
             searches=1,
             scp=replace(first.scp, effort_tolerance=_EFFORT_TOLERANCE),
-            grid=replace(first.grid, preference=settings.side_preference),
         )
         self.planners = SpacecraftPlanner(first), SpacecraftPlanner(again)
         worlds, agents = len(scenarios), scenarios[0].num_agents

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -32,21 +32,13 @@ from lagros_policies.imitation.train_deep_set import (
     flight_samples,
     join,
 )
-from lagros_policies.spacecraft_expert import SpacecraftExpertSettings
 
 BOUNDS = (0.2, 0.4, 0.6, 0.8, 1.0)
 _RELABELLED = "relabelled"
 
 
 def _rounds() -> tuple[FlightSettings, ...]:
-    first = FlightSettings(worlds=200, replan_period=2.0)
-    # What remains after four rounds are agents that rest before an obstacle: the last round says
-    # which side to take, and asks u* rather than the plan for the speed.
-    decided = SpacecraftExpertSettings(start_weight=0.5, side_preference=0.25)
-    return (
-        *(replace(first, seed=seed) for seed in (11, 12, 13, 14)),
-        replace(first, worlds=300, seed=15, expert=decided),
-    )
+    return tuple(FlightSettings(worlds=200, replan_period=2.0, seed=11 + one) for one in range(8))
 
 
 @dataclass(frozen=True)

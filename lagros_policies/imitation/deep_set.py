@@ -82,24 +82,16 @@ class DeepSet:
         first, second = self._widths
         inputs = np.zeros((count, own + first + second), np.float32)
         inputs[:, :own] = features.own
-        if len(features.neighbours):
-            values = _through(self.layers["neighbour"], features.neighbours)
-            pool(
-                values,
-                features.neighbour_owner,
-                features.neighbour_weight,
-                inputs[:, own : own + first],
-            )
-        if len(features.obstacles):
-            values = _through(self.layers["obstacle"], features.obstacles)
-            pool(
-                values,
-                features.obstacle_owner,
-                features.obstacle_weight,
-                inputs[:, own + first :],
-            )
+        end = own
+        for name, width, elements in zip(
+            _PARTS, self._widths, (features.neighbours, features.obstacles), strict=False
+        ):
+            begin, end = end, end + width
+            if len(elements.owner):
+                values = _through(self.layers[name], elements.values)
+                pool(values, elements.owner, elements.weight, inputs[:, begin:end])
         *hidden, (weight, bias) = self.layers["agent"]
-        outputs = _through(hidden, inputs) @ weight
+        outputs: Float32Array = np.dot(_through(hidden, inputs), weight)
         outputs += bias
         return outputs
 
@@ -150,7 +142,7 @@ class DeepSet:
 def _through(layers: list[tuple[Float32Array, Float32Array]], values: Float32Array) -> Float32Array:
     """Return the values after some layers, each followed by a ReLU."""
     for weight, bias in layers:
-        values = values @ weight
+        values = np.dot(values, weight)
         values += bias
         np.maximum(values, 0.0, out=values)
     return values
@@ -167,10 +159,11 @@ def pool(
         weight: Shape (e,).
         sums: Zeros, shape (B, h).
     """
+    if len(sums) == 1:
+        np.dot(weight, values, out=sums[0])
+        return
     if len(sums) * len(values) <= _DENSE:
-        share = np.zeros((len(sums), len(values)), np.float32)
-        share[owner, np.arange(len(values))] = weight
-        sums[:] = share @ values
+        sums[:] = np.dot((owner == np.arange(len(sums))[:, None]) * weight, values)
         return
     values *= weight[:, None]
     begins = np.flatnonzero(np.diff(owner, prepend=-1))

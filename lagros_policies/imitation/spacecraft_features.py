@@ -8,8 +8,7 @@ Vectors are complex numbers here: a turn is one product.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,33 +44,40 @@ NEIGHBOUR = (
 OBSTACLE = (*NEIGHBOUR, "distance of the centres at touch [m]")
 
 _SMALL = 1e-9  # [m]
+_DISTANCES = np.array([np.inf, 0.5])  # up to which the distance to the goal counts [m]
+_TIMES = np.array([np.inf, 5.0])  # up to which the time to go counts [s]
 _NEAR = 0.3  # scale of nearness = exp(-gap / _NEAR) [m]
 _FADE = 0.4  # what is sensed counts in full this far inside the sensing radius [m]
 
 
-@dataclass(frozen=True)
-class SpacecraftFeatures:
+class Elements(NamedTuple):
+    """The bodies of one kind that B agents sense, e in all.
+
+    Attributes:
+        values: One row for each, shape (e, f).
+        owner: Who senses it, ascending, shape (e,).
+        weight: From 0 at the rim of what is sensed to 1, shape (e,).
+    """
+
+    values: Float32Array
+    owner: NDArray[np.intp]
+    weight: Float32Array
+
+
+class SpacecraftFeatures(NamedTuple):
     """Inputs of a network for B agents.
 
     Attributes:
         own: Shape (B, len(OWN)).
-        neighbours: Shape (e, len(NEIGHBOUR)), one row for each neighbour that is sensed.
-        neighbour_owner: Whose neighbour each row is, ascending, shape (e,).
-        neighbour_weight: From 0 at the rim of what is sensed to 1, shape (e,).
-        obstacles: Shape (f, len(OBSTACLE)), and likewise owners and weights.
-        obstacle_owner: Shape (f,).
-        obstacle_weight: Shape (f,).
+        neighbours: Rows of len(NEIGHBOUR).
+        obstacles: Rows of len(OBSTACLE).
         frame: Unit vectors to the goals as complex numbers, shape (B,); a force of the world is the
             network's times this.
     """
 
     own: Float32Array
-    neighbours: Float32Array
-    neighbour_owner: NDArray[np.intp]
-    neighbour_weight: Float32Array
-    obstacles: Float32Array
-    obstacle_owner: NDArray[np.intp]
-    obstacle_weight: Float32Array
+    neighbours: Elements
+    obstacles: Elements
     frame: ComplexArray
 
 
@@ -86,60 +92,59 @@ def spacecraft_features(
         agent_radius: Radius of every agent against the others [m].
         core_radius: Radius against obstacles [m].
     """
-    goal = _complex(sensed.goal)
-    distance = np.abs(goal)
-    far = distance > _SMALL
-    frame = cast(ComplexArray, np.where(far, goal, 1.0) / np.where(far, distance, 1.0))
+    goal, course = _complex(sensed.goal), _complex(sensed.velocity)
+    # A shift that no observation, in single precision, can undo: nothing is divided by zero.
+    shifted = goal + _SMALL
+    distance = np.abs(shifted)
+    frame = shifted / distance
     back = frame.conj()
-    velocity = _complex(sensed.velocity) * back
     left = np.maximum(settings.horizon - sensed.time, 0.0)
     own = np.empty((len(goal), len(OWN)), np.float32)
-    own[:, 0] = distance
-    own[:, 1] = np.minimum(distance, 0.5)
-    own[:, 2:4] = _pairs(velocity)
-    own[:, 4] = left
-    own[:, 5] = np.minimum(left, 5.0)
-    own[:, 6] = distance / (left + 5.0)
-    own[:, 7] = sensed.heading_change
-    own[:, 8] = sensed.spin
+    np.minimum(distance[:, None], _DISTANCES, out=own[:, 0:2])
+    own[:, 2:4] = _pairs(course * back)
+    np.minimum(left[:, None], _TIMES, out=own[:, 4:6])
+    np.divide(distance, left + _TIMES[1], out=own[:, 6])
+    own[:, 7:9] = sensed.own[:, 6:8]  # turn and spin
     # Neighbours first, then obstacles: one table for both.
-    whose, slot = np.nonzero(sensed.neighbour_mask)
+    whose, slot = sensed.neighbour_mask.nonzero()
     others = sensed.neighbours[whose, slot]
-    owner, slot = np.nonzero(sensed.obstacle_mask)
+    owner, slot = sensed.obstacle_mask.nonzero()
     discs = sensed.obstacles[owner, slot]
-    turn = back[np.concatenate([whose, owner])]
-    apart = _complex(np.concatenate([others[:, :2], discs[:, :2]])) * turn
-    motion = np.concatenate([_complex(others[:, 2:]) * turn[: len(whose)], -velocity[owner]])
-    reach = np.concatenate([np.zeros(len(whose)), discs[:, 2]])
-    touch = reach + core_radius
-    touch[: len(whose)] = 2.0 * agent_radius
-    centre = np.maximum(np.abs(apart), _SMALL)
+    first, count = len(whose), len(whose) + len(owner)
+    # Where each body is and how it moves, relative to the agent.
+    moving = np.empty((count, 2), np.complex128)
+    moving[:first] = others.view(np.complex128)
+    moving[first:, 0] = _complex(discs[:, :2])
+    moving[first:, 1] = -course[owner]
+    moving *= back[np.concatenate([whose, owner])][:, None]
+    apart, motion = moving[:, 0], moving[:, 1]
+    # Distances of the centres at touch, and at the rim of what is sensed.
+    touch, rim = np.empty(count), np.empty(count)
+    touch[:first], rim[:first] = 2.0 * agent_radius, settings.sensing_radius
+    np.add(discs[:, 2], core_radius, out=touch[first:])
+    np.add(discs[:, 2], settings.sensing_radius, out=rim[first:])
+    centre = np.abs(apart) + _SMALL
     unit, gap = apart / centre, centre - touch
-    table = np.empty((len(gap), len(OBSTACLE)), np.float32)
+    table = np.empty((count, len(OBSTACLE)), np.float32)
     table[:, 0:2] = _pairs(unit)
     table[:, 2] = gap
     # Deep inside another body nearness would explode.
-    table[:, 3] = np.exp(np.maximum(gap, -_NEAR) * (-1.0 / _NEAR))
-    table[:, 4:6] = _pairs(motion)
-    table[:, 6] = -(unit.conj() * motion).real
+    np.exp(np.maximum(gap, -_NEAR) * (-1.0 / _NEAR), out=table[:, 3])
+    table[:, 4:6] = moving.view(np.float64)[:, 2:]
+    table[:, 6] = (unit.conj() * -motion).real
     table[:, 7] = touch
-    weight = np.minimum((settings.sensing_radius + reach - centre) * (1.0 / _FADE), 1.0)
+    weight = np.minimum((rim - centre) * (1.0 / _FADE), 1.0)
     weight = np.maximum(weight, 0.0).astype(np.float32)
-    first = len(whose)
     return SpacecraftFeatures(
         own,
-        table[:first, : len(NEIGHBOUR)],
-        whose,
-        weight[:first],
-        table[first:],
-        owner,
-        weight[first:],
+        Elements(table[:first, : len(NEIGHBOUR)], whose, weight[:first]),
+        Elements(table[first:], owner, weight[first:]),
         frame,
     )
 
 
 def _complex(vectors: FloatArray) -> ComplexArray:
-    value: ComplexArray = np.ascontiguousarray(vectors).view(np.complex128)[..., 0]
+    value: ComplexArray = vectors.view(np.complex128)[..., 0]
     return value
 
 

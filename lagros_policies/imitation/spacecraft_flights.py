@@ -59,7 +59,7 @@ class FlightSettings:
 
     worlds: int = 600
     worlds_per_shard: int = 10
-    agents: tuple[int, ...] = (2, 4, 5, 6, 6, 6, 7, 8)
+    agents: tuple[int, ...] = (1, 2, 4, 5, 6, 6, 6, 7, 8)
     open_share: float = 0.25
     disturbance_bound: float = 1.2
     replan_period: float | None = None

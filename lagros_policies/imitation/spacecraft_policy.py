@@ -75,13 +75,14 @@ class SpacecraftNetworkPolicy:
         """Return u >= 0 of each agent, shape (B, 8) [N], for observations (B, o) or (o,)."""
         sensed = Sensed.of(self.layout, observation)
         features = self.features(sensed)
-        answer = self.network(features).astype(np.float64)
+        wrench = self.network(features).astype(np.float64)
         body = self.settings.system
-        # Into the world's axes, then into the body's, as complex numbers.
-        force = (answer[:, 0] + 1j * answer[:, 1]) * features.frame
-        force *= body.mass * np.exp(1j * sensed.heading)
-        torque = 2.0 * body.inertia * answer[:, 2]
-        return allocate(body, np.stack([force.real, force.imag, torque], axis=-1))
+        # Into the world's axes, then into the body's, as complex numbers in place.
+        force = wrench[:, :2].view(np.complex128)[:, 0]
+        force *= features.frame
+        force *= sensed.facing.view(np.complex128)[:, 0]
+        wrench *= (body.mass, body.mass, 2.0 * body.inertia)
+        return allocate(body, wrench)
 
     def features(self, sensed: Sensed) -> SpacecraftFeatures:
         """Return the inputs of the network."""

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from lagros_policies.imitation.spacecraft_features import (
     NEIGHBOUR,
     OBSTACLE,
     OWN,
+    Elements,
     SpacecraftFeatures,
     spacecraft_features,
 )
@@ -45,6 +46,8 @@ class DeepSetTraining:
         epochs: Passes over the data.
         batch: Samples per step.
         learning_rate: Adam's step at first; a cosine takes it to a hundredth of that.
+        outlier: Error beyond which the loss grows linearly, in units of the labels' root mean
+            square: where labels disagree, a small one follows the many and not the mean.
         checkpoint_every: Epochs between checkpoints.
         seed: Seed of initial weights and sample order.
 
@@ -57,6 +60,7 @@ class DeepSetTraining:
     epochs: int = 6
     batch: int = 1024
     learning_rate: float = 2e-3
+    outlier: float = 1.0
     checkpoint_every: int = 1
     seed: int = 0
 
@@ -66,8 +70,12 @@ class DeepSetTraining:
             widths = getattr(self, name)
             if not widths or min(widths) < 1:
                 raise ValueError(f"{name}={widths!r} must name at least one positive width")
-        if min(self.epochs, self.batch, self.checkpoint_every) < 1 or not self.learning_rate > 0.0:
-            raise ValueError("epochs, batch, checkpoint_every and learning_rate must be positive")
+        if min(self.epochs, self.batch, self.checkpoint_every) < 1:
+            raise ValueError("epochs, batch and checkpoint_every must be at least 1")
+        if not (self.learning_rate > 0.0 and self.outlier > 0.0):
+            raise ValueError(
+                f"learning_rate={self.learning_rate!r} and outlier={self.outlier!r} must be > 0"
+            )
 
 
 @dataclass(frozen=True)
@@ -112,30 +120,33 @@ def join(parts: Sequence[SetSamples]) -> SetSamples:
     """Return all samples in one; worlds of different parts stay different."""
     offsets = np.cumsum([0] + [len(part) for part in parts])
     worlds = np.cumsum([0] + [int(part.world.max(initial=-1)) + 1 for part in parts])
-    names = ("own", "neighbours", "neighbour_weight", "obstacles", "obstacle_weight", "frame")
-    joined: dict[str, Any] = {
-        name: np.concatenate([getattr(part.features, name) for part in parts]) for name in names
-    }
-    for name in ("neighbour_owner", "obstacle_owner"):
-        joined[name] = np.concatenate(
-            [
-                getattr(part.features, name) + offset
-                for part, offset in zip(parts, offsets, strict=False)
-            ]
-        )
+    features = [part.features for part in parts]
     return SetSamples(
-        SpacecraftFeatures(**joined),
+        SpacecraftFeatures(
+            np.concatenate([one.own for one in features]),
+            _join_elements([one.neighbours for one in features], offsets),
+            _join_elements([one.obstacles for one in features], offsets),
+            np.concatenate([one.frame for one in features]),
+        ),
         np.concatenate([part.target for part in parts]),
         np.concatenate([part.world + first for part, first in zip(parts, worlds, strict=False)]),
     )
 
 
-class _Ragged:
-    """The elements of each sample, to be picked by samples."""
+def _join_elements(parts: Sequence[Elements], offsets: IntArray) -> Elements:
+    return Elements(
+        np.concatenate([part.values for part in parts]),
+        np.concatenate([part.owner + first for part, first in zip(parts, offsets, strict=False)]),
+        np.concatenate([part.weight for part in parts]),
+    )
 
-    def __init__(self, values: Float32Array, owner: IntArray, weight: Float32Array, count: int):
-        self.values, self.weight = values, weight
-        self.count = np.bincount(owner, minlength=count)
+
+class _Ragged:
+    """The elements of each of `count` samples, with scaled values, to be picked by samples."""
+
+    def __init__(self, elements: Elements, values: Float32Array, count: int) -> None:
+        self.values, self.weight = values, elements.weight
+        self.count = np.bincount(elements.owner, minlength=count)
         self.begin = np.cumsum(self.count) - self.count
 
     def pick(self, samples: IntArray) -> tuple[Float32Array, IntArray, Float32Array]:
@@ -155,8 +166,8 @@ def fit_deep_set(
 ) -> DeepSet:
     """Fit a network by Adam on the Huber loss of the scaled accelerations.
 
-    The labels of one observation scatter, because an agent does not sense what others plan; the
-    mean of the labels, which the square of small errors asks for, is what to do then.
+    The labels of one observation scatter, because an agent does not sense what others plan. The
+    square of small errors asks for the mean of the labels, the size of large ones for a median.
 
     Args:
         samples: What to fit.
@@ -192,27 +203,19 @@ class _Run:
 
         self.settings, self.checkpoint = settings, checkpoint
         features, count = samples.features, len(samples)
-        self.scales = [
-            _statistics(values)
-            for values in (features.own, features.neighbours, features.obstacles)
-        ]
+        inputs = features.own, features.neighbours.values, features.obstacles.values
+        self.scales = [_statistics(values) for values in inputs]
         own, neighbours, obstacles = (
             (values - mean) / deviation
-            for values, (mean, deviation) in zip(
-                (features.own, features.neighbours, features.obstacles), self.scales, strict=True
-            )
+            for values, (mean, deviation) in zip(inputs, self.scales, strict=True)
         )
         # One scale for the plane; the torque, which is easy, counts a third of it.
         plane = float(np.sqrt(np.mean(samples.target[:, :2] ** 2)))
         turn = float(np.sqrt(np.mean(samples.target[:, 2] ** 2)))
         self.target_scale = np.array([plane, plane, max(3.0 * turn, 1e-3)], np.float32)
         self.own, self.target = own, samples.target / self.target_scale
-        self.neighbours = _Ragged(
-            neighbours, features.neighbour_owner, features.neighbour_weight, count
-        )
-        self.obstacles = _Ragged(
-            obstacles, features.obstacle_owner, features.obstacle_weight, count
-        )
+        self.neighbours = _Ragged(features.neighbours, neighbours, count)
+        self.obstacles = _Ragged(features.obstacles, obstacles, count)
         torch.manual_seed(settings.seed)
         wide = settings.element[-1]
         self.parts = [
@@ -241,7 +244,8 @@ class _Run:
             rate = settings.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
             self.optimiser.param_groups[0]["lr"] = rate
             target = torch.from_numpy(self.target[batch])
-            loss = torch.nn.functional.smooth_l1_loss(self._forward(batch), target)
+            answer = self._forward(batch)
+            loss = torch.nn.functional.smooth_l1_loss(answer, target, beta=settings.outlier)
             self.optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             self.optimiser.step()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lagros_envs.observation import Layout
-from lagros_envs.scenarios import preset_named
+from lagros_envs.scenarios import Scenario, preset_named
 from lagros_envs.seeding import EVALUATION, episode_seeds, episode_streams
 from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_policies.imitation import train_deep_set
@@ -90,6 +90,18 @@ def test_a_new_plan_may_begin_beside_the_states_but_not_in_touch(world):
     assert label[0, 0] < 0.0 < label[1, 0]  # u* pushes them apart
 
 
+@pytest.mark.parametrize("step", [0, 50])
+@pytest.mark.parametrize(("preference", "side"), [(0.01, 1.0), (0.25, -1.0)])
+def test_every_plan_passes_counter_clockwise_where_both_sides_are_alike(step, preference, side):
+    # Above is a little shorter, and clockwise.
+    scenario = Scenario([[0.0, 0.0]], [0.0], [[4.0, 0.0]], [[2.0, -0.1]], [0.5])
+    settings = SpacecraftExpertSettings(side_preference=preference)
+    expert = SpacecraftExpert([scenario], settings, TASK)
+    assert expert.plan(0, step, np.zeros((1, 6)))
+    height = expert.nominal[0, step:, 0, 1]
+    assert side * height[np.argmax(np.abs(height))] > 0.3
+
+
 def test_who_is_late_does_not_rush(world):
     expert = SpacecraftExpert([world], SpacecraftExpertSettings(), TASK)
     states = np.zeros((3, 6))
@@ -130,7 +142,7 @@ def random_samples(count: int, seed: int) -> SetSamples:
         rows[:, layout.slices[mask]] = rng.random((count, 1)) < 0.5
     features = spacecraft_features(Sensed.of(layout, rows), TASK, 0.25, 0.25)
     target = np.zeros((count, 3), np.float32)
-    np.add.at(target[:, 0], features.neighbour_owner, features.neighbours[:, 3])
+    np.add.at(target[:, 0], features.neighbours.owner, features.neighbours.values[:, 3])
     target[:, 1:] = rng.normal(size=(count, 2)) * 0.1
     return SetSamples(features, target, np.arange(count))
 
@@ -176,10 +188,10 @@ def test_the_network_without_torch_is_the_one_that_was_trained(tmp_path):
 def test_joined_samples_keep_their_elements_and_worlds(flights):
     one = flight_samples(flights, TASK, 0.25, 0.25)
     both = join([one, one])
-    count, elements = len(one), len(one.features.neighbours)
+    count, elements = len(one), len(one.features.neighbours.owner)
     assert len(both) == 2 * count
     np.testing.assert_array_equal(
-        both.features.neighbour_owner[elements:], one.features.neighbour_owner + count
+        both.features.neighbours.owner[elements:], one.features.neighbours.owner + count
     )
     assert set(both.world[:count]).isdisjoint(both.world[count:])
 
@@ -225,10 +237,10 @@ def test_expert_and_training_settings_are_checked():
 
 def test_an_input_that_never_varied_does_not_count(tmp_path):
     samples = random_samples(300, 6)
-    samples.features.obstacles[:, 7] = 0.75  # bodies of one size, say
+    samples.features.obstacles.values[:, 7] = 0.75  # bodies of one size, say
     network = fit_deep_set(samples, DeepSetTraining((8,), (8,), 1), tmp_path / "c")
     before = network(samples.features)
-    samples.features.obstacles[:, 7] = 0.5
+    samples.features.obstacles.values[:, 7] = 0.5
     np.testing.assert_allclose(network(samples.features), before, atol=1e-6)
-    samples.features.obstacles[:, 2] += 0.5  # an input that did vary does count
+    samples.features.obstacles.values[:, 2] += 0.5  # an input that did vary does count
     assert np.abs(network(samples.features) - before).max() > 1e-3
