@@ -13,7 +13,7 @@ from lagros_envs import spacecraft_task as task
 from lagros_envs.dynamics.spacecraft import HEADING, SPIN
 from lagros_envs.observation import OBSTACLE_DIM
 from lagros_envs.scenarios import Preset, preset_named
-from lagros_policies.contraction.double_integrator import design_axis, expected_margin
+from lagros_policies.contraction.double_integrator import planned_margin
 from lagros_policies.contraction.wrench_control import WrenchTracking
 from lagros_policies.planning.joint_plan import JointPlan
 from lagros_policies.planning.spacecraft import SpacecraftPlanner, SpacecraftPlannerSettings
@@ -24,9 +24,7 @@ FloatArray = NDArray[np.float64]
 
 # Time from node to node of a plan [s].
 _NODE_PERIOD = 0.5
-# No plan keeps less than this [m] at first, however small the disturbance ...
-_LEAST_MARGIN = 0.05
-# ... and where there is none, these shares of the margin are tried in turn.
+# Where no plan keeps the margin these shares of it are tried in turn.
 _SHARES = (1.0, 0.75, 0.5, 0.25)
 # Two agents err independently, so that their distance errs sqrt(2) times as far. At d_bar = 1, 60
 # worlds: success 99.7 % (99.4 % on 60 worlds not looked at before), against 96.4 % with equal room
@@ -136,23 +134,13 @@ class CentralizedPolicy:
         self.preset = preset_named(preset).for_agents(num_agents)
         self.agents = self.preset.agents
         self.obstacles = max(1, self.preset.obstacle_count[1])
-        if not 0.0 <= disturbance_bound < np.inf:
-            raise ValueError(f"disturbance_bound={disturbance_bound!r} must be finite and >= 0")
-        for name, rate in (("contraction_rate", contraction_rate), ("turning_rate", turning_rate)):
-            if not 0.0 < rate < np.inf:
-                raise ValueError(f"{name}={rate!r} must be positive and finite")
         if margin is not None and planner is not None:
             raise ValueError("give margin or planner, not both: a planner has its own margins")
-        if margin is not None and not 0.0 <= margin < np.inf:
-            raise ValueError(f"margin={margin!r} must be finite and >= 0, or None")
         body, period = self.settings.system, self.settings.control_period
-        self.tracking = WrenchTracking(
-            body, design_axis(contraction_rate, period), design_axis(turning_rate, period)
-        )
-        if margin is None:
-            margin = max(_LEAST_MARGIN, expected_margin(disturbance_bound, contraction_rate))
+        self.tracking = WrenchTracking.for_rates(body, period, contraction_rate, turning_rate)
+        wanted = planned_margin(margin, disturbance_bound, contraction_rate)
         if planner is None:
-            planner = planner_settings(self.settings, margin)
+            planner = planner_settings(self.settings, wanted)
         elif planner.control_period != period or planner.mass != body.mass:
             raise ValueError(
                 f"the planner is for control_period={planner.control_period!r} and "

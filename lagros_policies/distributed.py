@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lagros_envs import spacecraft_task as task
 from lagros_envs.observation import Layout
 from lagros_envs.scenarios import Preset, preset_named
-from lagros_policies.contraction.double_integrator import design_axis, expected_margin
+from lagros_policies.contraction.double_integrator import planned_margin
 from lagros_policies.contraction.wrench_control import WrenchTracking
 from lagros_policies.planning.local_map import LocalMap
 from lagros_policies.planning.local_motion import Discs, LocalPlan
@@ -23,8 +23,6 @@ from lagros_policies.sensed import Sensed
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
-# No plan asks for less room than this [m], however small the disturbance.
-_LEAST_MARGIN = 0.05
 # Two agents err independently, so that their distance errs sqrt(2) times as far.
 _PAIR_SHARE = math.sqrt(2.0)
 # A neighbour slower than this [m/s] is taken to rest, plus this for each unit of the bound: what is
@@ -131,25 +129,14 @@ class DistributedTubeMpcPolicy:
         self.settings = settings or task.SpacecraftSettings()
         self.preset = preset_named(preset).for_agents(num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
-        if not 0.0 <= disturbance_bound < np.inf:
-            raise ValueError(f"disturbance_bound={disturbance_bound!r} must be finite and >= 0")
-        for name, rate in (("contraction_rate", contraction_rate), ("turning_rate", turning_rate)):
-            if not 0.0 < rate < np.inf:
-                raise ValueError(f"{name}={rate!r} must be positive and finite")
-        if margin is not None and not 0.0 <= margin < np.inf:
-            raise ValueError(f"margin={margin!r} must be finite and >= 0, or None")
         if replan_every < 1:
             raise ValueError(f"replan_every={replan_every!r} must be at least 1 control step")
         for name, time in (("kept_for", kept_for), ("smoothing", smoothing)):
             if not 0.0 <= time < np.inf:
                 raise ValueError(f"{name}={time!r} must be finite and >= 0")
         body, period = self.settings.system, self.settings.control_period
-        self.tracking = WrenchTracking(
-            body, design_axis(contraction_rate, period), design_axis(turning_rate, period)
-        )
-        if margin is None:
-            margin = max(_LEAST_MARGIN, expected_margin(disturbance_bound, contraction_rate))
-        self.margin = margin
+        self.tracking = WrenchTracking.for_rates(body, period, contraction_rate, turning_rate)
+        self.margin = planned_margin(margin, disturbance_bound, contraction_rate)
         self.replan_every, self.kept_for, self.smoothing = replan_every, kept_for, smoothing
         self.still = _STILL + _STILL_NOISE * disturbance_bound
         planner = planner or LocalPlannerSettings(mass=body.mass)

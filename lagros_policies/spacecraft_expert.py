@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from lagros_envs.scenarios import Scenario
 from lagros_envs.spacecraft_task import STATE_DIM, SpacecraftSettings
 from lagros_policies.centralized import planner_settings
-from lagros_policies.contraction.double_integrator import design_axis
 from lagros_policies.contraction.wrench_control import WrenchTracking
+from lagros_policies.pace import time_to_go
 from lagros_policies.planning.spacecraft import SpacecraftPlanner
 
 FloatArray = NDArray[np.float64]
@@ -41,9 +41,6 @@ class SpacecraftExpertSettings:
         turning_rate: alpha of the heading [1/s].
         start_weight: Cost of a plan's deviation e from the state, as a share of e'Me / 2; small, so
             that a plan moves as it would like to and u* brings the agent there.
-        least_time: A new plan never asks for an arrival sooner than this [s] ...
-        cruise_speed: ... nor sooner than at this mean speed on the straight line [m/s]: who is late
-            arrives late, and does not rush.
         side_preference: Share by which plans find going counter-clockwise around an obstacle
             cheaper. Labels that go left in one world and right in the next add up to nothing, and
             what imitates them comes to rest before the obstacle.
@@ -56,8 +53,6 @@ class SpacecraftExpertSettings:
     contraction_rate: float = 2.0
     turning_rate: float = 0.3
     start_weight: float = 0.5
-    least_time: float = 2.0
-    cruise_speed: float = 0.2
     side_preference: float = 0.25
 
     def __post_init__(self) -> None:
@@ -86,10 +81,8 @@ class SpacecraftExpert:
         """Build planner and law; `plan` must be called for every world before `acceleration`."""
         self.scenarios, self.settings, self.task = scenarios, settings, task
         period = task.control_period
-        self.tracking = WrenchTracking(
-            task.system,
-            design_axis(settings.contraction_rate, period),
-            design_axis(settings.turning_rate, period),
+        self.tracking = WrenchTracking.for_rates(
+            task.system, period, settings.contraction_rate, settings.turning_rate
         )
         first = planner_settings(task, settings.margin)
         first = replace(first, grid=replace(first.grid, preference=settings.side_preference))
@@ -128,14 +121,14 @@ class SpacecraftExpert:
         self.plans += 1
         if step > 0:
             start_cost = settings.start_weight * self.tracking.plane.matrix
-            left = max(task.horizon - step * task.control_period, settings.least_time)
             way = np.linalg.norm(scenario.goals - states[:, :2], axis=1)
             if not np.all(way <= SEARCH_RADIUS):
                 self.failed_plans += 1
                 return False
             planner = self.planners[1]
             node = planner.settings.node_period
-            durations = np.ceil(np.maximum(left, way / settings.cruise_speed) / node - 1e-9) * node
+            time = time_to_go(way, task.horizon - step * task.control_period)
+            durations = np.ceil(time / node - 1e-9) * node
         plan = planner.plan(
             states[:, _PLANE],
             scenario.goals,

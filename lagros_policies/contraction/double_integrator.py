@@ -36,6 +36,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 # 0.1 s, at alpha = 1 with the metric of least chi; and the power of 1/alpha.
 _EXPECTED_ERROR = 0.378
 _EXPECTED_POWER = 0.41
+_LEAST_MARGIN = 0.05  # of a plan, for what is not disturbance [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,6 +239,26 @@ def expected_margin(disturbance_bound: float, rate: float) -> float:
         rate: alpha of u* [1/s].
     """
     return float(_EXPECTED_ERROR * disturbance_bound * rate**-_EXPECTED_POWER)
+
+
+def planned_margin(margin: float | None, disturbance_bound: float, rate: float) -> float:
+    """Return the margin that a planner asks for: the given one, or the expected one [m].
+
+    Args:
+        margin: Given by the user, or None.
+        disturbance_bound: d_bar that the plan is to withstand.
+        rate: alpha of u* [1/s].
+
+    Raises:
+        ValueError: A value is negative or not finite.
+    """
+    if not 0.0 <= disturbance_bound < np.inf:
+        raise ValueError(f"disturbance_bound={disturbance_bound!r} must be finite and >= 0")
+    if margin is None:
+        return max(_LEAST_MARGIN, expected_margin(disturbance_bound, rate))
+    if not 0.0 <= margin < np.inf:
+        raise ValueError(f"margin={margin!r} must be finite and >= 0, or None")
+    return margin
 
 
 def rate_for_margin(disturbance_bound: float, margin: float) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.dynamics.spacecraft import HEADING, SPIN, Spacecraft
-from lagros_policies.contraction.double_integrator import AxisMetric, flow
+from lagros_policies.contraction.double_integrator import AxisMetric, design_axis, flow
 from lagros_policies.contraction.thrusters import thrust_for_acceleration
 
 FloatArray = NDArray[np.float64]
@@ -108,6 +108,27 @@ class WrenchTracking:
                 f"plane and turning need one period > 0, not {self.plane.period!r} and "
                 f"{self.turning.period!r}"
             )
+
+    @classmethod
+    def for_rates(
+        cls, body: Spacecraft, period: float, contraction_rate: float, turning_rate: float
+    ) -> WrenchTracking:
+        """Return the law with the metrics of least chi for two rates.
+
+        Args:
+            body: The spacecraft.
+            period: The hold's [s].
+            contraction_rate: alpha in the plane [1/s].
+            turning_rate: alpha of the heading [1/s].
+
+        Raises:
+            ValueError: A rate is not positive and finite.
+        """
+        rates = {"contraction_rate": contraction_rate, "turning_rate": turning_rate}
+        for name, rate in rates.items():
+            if not 0.0 < rate < np.inf:
+                raise ValueError(f"{name}={rate!r} must be positive and finite")
+        return cls(body, design_axis(contraction_rate, period), design_axis(turning_rate, period))
 
     def acceleration(
         self, state: FloatArray, nominal: FloatArray, nominal_acceleration: FloatArray

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_policies.pace import time_to_go
 from lagros_policies.sensed import Sensed
 
 Float32Array = NDArray[np.float32]
@@ -98,7 +99,7 @@ def spacecraft_features(
     distance = np.abs(shifted)
     frame = shifted / distance
     back = frame.conj()
-    left = np.maximum(settings.horizon - sensed.time, 0.0)
+    left = time_to_go(distance, settings.horizon - sensed.time)
     own = np.empty((len(goal), len(OWN)), np.float32)
     np.minimum(distance[:, None], _DISTANCES, out=own[:, 0:2])
     own[:, 2:4] = _pairs(course * back)

@@ -229,8 +229,8 @@ def test_flight_settings_are_checked(change, message):
 
 
 def test_expert_and_training_settings_are_checked():
-    with pytest.raises(ValueError, match="cruise_speed"):
-        SpacecraftExpertSettings(cruise_speed=0.0)
+    with pytest.raises(ValueError, match="margin"):
+        SpacecraftExpertSettings(margin=0.0)
     with pytest.raises(ValueError, match="element"):
         DeepSetTraining(element=())
 
