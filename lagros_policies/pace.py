@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-CRUISE_SPEED = 0.2  # mean speed on the straight line that nobody has to exceed [m/s]
+CRUISE_SPEED = 0.3  # mean speed on the straight line that nobody has to exceed [m/s]
 LEAST_TIME = 2.0  # [s]
 
 

@@ -43,7 +43,8 @@ class DeepSetTraining:
     Attributes:
         element: Widths of the layers of phi_n and phi_o.
         agent: Widths of the hidden layers of rho.
-        epochs: Passes over the data.
+        epochs: Passes over the data; samples of one world resemble each other, and more passes fit
+            the worlds.
         batch: Samples per step.
         learning_rate: Adam's step at first; a cosine takes it to a hundredth of that.
         outlier: Error beyond which the loss grows linearly, in units of the labels' root mean
@@ -57,10 +58,10 @@ class DeepSetTraining:
 
     element: tuple[int, ...] = (100, 100)
     agent: tuple[int, ...] = (100, 100)
-    epochs: int = 6
-    batch: int = 1024
+    epochs: int = 2
+    batch: int = 512
     learning_rate: float = 2e-3
-    outlier: float = 1.0
+    outlier: float = 0.2
     checkpoint_every: int = 1
     seed: int = 0
 

@@ -27,6 +27,7 @@ from lagros_policies.imitation.train_deep_set import (
     flight_samples,
     join,
 )
+from lagros_policies.pace import CRUISE_SPEED
 from lagros_policies.sensed import Sensed
 from lagros_policies.spacecraft_expert import SpacecraftExpert, SpacecraftExpertSettings
 
@@ -112,7 +113,7 @@ def test_who_is_late_does_not_rush(world):
     # Nobody is at rest at the goal by the horizon, and everybody is by the time that it takes.
     way = np.linalg.norm(world.goals - world.starts, axis=1)
     for agent in range(3):
-        arrival = 290 + round(way[agent] / 0.2 / 0.1) + 10
+        arrival = 290 + round(way[agent] / CRUISE_SPEED / 0.1) + 10
         if arrival <= TASK.steps:
             np.testing.assert_allclose(
                 expert.nominal[0, arrival, agent, :2], world.goals[agent], atol=1e-6
