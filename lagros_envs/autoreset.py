@@ -1,8 +1,23 @@
-"""How a vector environment starts the next episode of a world that has ended."""
+"""What vector environments share: seeds, masks, and how a world whose episode ended starts anew."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from lagros_envs.disturbances import Disturbance
+
+Float32Array = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
 
 MODES = {
     "next_step": AutoresetMode.NEXT_STEP,
@@ -22,3 +37,184 @@ def autoreset_mode_named(mode: str | AutoresetMode) -> AutoresetMode:
     if mode not in MODES:
         raise ValueError(f"autoreset_mode={mode!r} must be one of {', '.join(MODES)}")
     return MODES[mode]
+
+
+class RestartingVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, Any]):
+    """Worlds side by side, each of which starts a new episode when its own has ended.
+
+    A world has one row or more in what is observed and done. A subclass moves the worlds and says
+    how one starts; `reset` and the autoreset modes are here.
+
+    `reset(seed=...)` takes one integer, from which the worlds draw independent seeds, or a list
+    with one seed per world, each of which starts the episode that the single environment starts.
+    `reset(options=...)` takes `reset_mask` (worlds,), the worlds to start; what the options say of
+    the others is not looked at.
+
+    Args:
+        num_envs: Number of rows.
+        num_worlds: Number of worlds.
+        single_observation_space: Of one row.
+        single_action_space: Of one row.
+        disturbance: The disturbance.
+        autoreset_mode: "next_step" (Gymnasium's default), "same_step" (the last observation and
+            info of an episode come in `info["final_obs"]` and `info["final_info"]`) or "disabled".
+        render_mode: Must be None.
+        drawn_by: What a user who wants to see a world makes instead.
+
+    Raises:
+        ValueError: The mode is unknown, or a render mode was asked for.
+    """
+
+    metadata = {
+        "render_modes": [],
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int,
+        num_worlds: int,
+        single_observation_space: spaces.Space[Any],
+        single_action_space: spaces.Space[Any],
+        disturbance: Disturbance,
+        autoreset_mode: str | AutoresetMode,
+        render_mode: str | None,
+        drawn_by: str,
+    ) -> None:
+        """Set up the spaces; see the class for the arguments."""
+        if render_mode is not None:
+            raise ValueError(
+                f"render_mode={render_mode!r}: the vector environment does not draw; use {drawn_by}"
+            )
+        self.num_envs, self.num_worlds = num_envs, num_worlds
+        self.single_observation_space = single_observation_space
+        self.single_action_space = single_action_space
+        self.observation_space = batch_space(single_observation_space, num_envs)
+        self.action_space = batch_space(single_action_space, num_envs)
+        self.disturbance = disturbance
+        self.autoreset_mode = autoreset_mode_named(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        self.render_mode = None
+        # Worlds whose episode ended and that start anew on the next call of step.
+        self._pending = np.zeros(num_worlds, bool)
+        self._started = False
+
+    @abstractmethod
+    def _start(self, worlds: IntArray, seeds: Sequence[int], options: dict[str, Any]) -> None:
+        """Begin an episode in these worlds, one seed for each."""
+
+    @abstractmethod
+    def _set_nominal(self, mask: BoolArray, options: dict[str, Any]) -> None:
+        """Take the nominal trajectories of the masked worlds from the options of a reset."""
+
+    @abstractmethod
+    def _forget_nominal(self, mask: BoolArray) -> None:
+        """The masked worlds start an episode that nobody has planned."""
+
+    @abstractmethod
+    def _observation(self) -> Float32Array:
+        """Return the observation of every row."""
+
+    @abstractmethod
+    def _info(self) -> dict[str, Any]:
+        """Return the info, every entry an array of its own with a leading axis of rows."""
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Float32Array, dict[str, Any]]:
+        """Start an episode in every world, or in those of `options["reset_mask"]`.
+
+        Args:
+            seed: One integer, or one per world.
+            options: See the class.
+
+        Returns:
+            Observations, one per row, and the info, whose entries have a leading axis of rows.
+
+        Raises:
+            ValueError: A seed list or an option has a wrong length, shape or value.
+        """
+        options = options or {}
+        seeds = self._seeds(seed)
+        if seeds is not None:
+            # The episodes that autoreset starts are as reproducible as the first ones.
+            self.np_random = np.random.default_rng(seeds)
+        elif seed is not None:
+            super().reset(seed=int(cast(int, seed)))
+        mask = np.asarray(options.get("reset_mask", np.ones(self.num_worlds, bool)))
+        if mask.shape != (self.num_worlds,) or mask.dtype != np.bool_:
+            raise ValueError(
+                f"options['reset_mask'] must be {self.num_worlds} booleans, one per world"
+            )
+        if not self._started and not mask.all():
+            raise ValueError("the first reset must start every world; leave out reset_mask")
+        self._set_nominal(mask, options)
+        self._begin(mask, seeds, options)
+        self._started = True
+        return self._observation(), self._info()
+
+    def _need_start(self) -> None:
+        if not self._started:
+            raise RuntimeError("call reset() before step()")
+
+    def _restart_pending(self) -> BoolArray | None:
+        """Start what the last step has left to be started; return which worlds that are, if any."""
+        restarting = self._pending
+        if not np.count_nonzero(restarting):
+            return None
+        self._begin_unasked(restarting)
+        return restarting
+
+    def _after_step(self, ended: BoolArray) -> tuple[Float32Array, dict[str, Any]]:
+        """Return observation and info of a step, after the restarts that the mode asks for.
+
+        Args:
+            ended: Which worlds' episodes ended on this step.
+        """
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            self._pending = ended
+        elif self.autoreset_mode is AutoresetMode.SAME_STEP and np.count_nonzero(ended):
+            final_observation, final_info = self._observation(), self._info()
+            self._begin_unasked(ended)
+            rows = np.repeat(ended, self.num_envs // self.num_worlds)
+            info = self._info()
+            info["final_obs"], info["_final_obs"] = final_observation, rows
+            info["final_info"], info["_final_info"] = final_info, rows
+            return self._observation(), info
+        return self._observation(), self._info()
+
+    def _seeds(self, seed: int | Sequence[int] | None) -> list[int] | None:
+        if seed is None or isinstance(seed, int | np.integer):
+            return None
+        seeds = [int(value) for value in seed]
+        if len(seeds) != self.num_worlds or min(seeds) < 0:
+            raise ValueError(
+                f"seed must be {self.num_worlds} non-negative integers, one per world; it is "
+                f"{seed!r}"
+            )
+        return seeds
+
+    def _begin_unasked(self, mask: BoolArray) -> None:
+        """Start the episodes of an autoreset, for which nobody has planned a nominal."""
+        if self.disturbance.kind == "worst":
+            raise ValueError(
+                'disturbance="worst" needs nominal trajectories for every episode, and an '
+                'autoreset starts one without: use autoreset_mode="disabled" and reset with '
+                'options={"nominal": ..., "reset_mask": ...}'
+            )
+        self._forget_nominal(mask)
+        self._begin(mask, None, {})
+
+    def _begin(self, mask: BoolArray, seeds: list[int] | None, options: dict[str, Any]) -> None:
+        """Start the masked worlds, from the seeds of all or from new ones."""
+        worlds = np.flatnonzero(mask)
+        chosen = (
+            self.np_random.integers(2**63, size=worlds.size).tolist()
+            if seeds is None
+            else [seeds[world] for world in worlds]
+        )
+        self._start(worlds, chosen, options)
+        self._pending = self._pending & ~mask

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
 from lagros_envs.disturbances import Disturbance, Situation, channel_mask
-from lagros_envs.dynamics.integrate import rk4_hold
+from lagros_envs.dynamics.held import HeldStep
 from lagros_envs.seeding import episode_streams
 
 FloatArray = NDArray[np.float64]
@@ -68,10 +68,13 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         disturbance_channels: "all", "rates", or a mask of the four states.
         metric: Contraction metric M for the kind "worst": (4, 4), or a function of the state.
         settings: The task.
+        compiled: Whether numba (the extra "fast") compiles the equation of motion; the trajectories
+            stay the same, bit for bit.
         render_mode: None, "human" or "rgb_array".
 
     Raises:
         ValueError: A setting is not valid.
+        ImportError: `compiled` was asked for and numba is not installed.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
@@ -83,6 +86,7 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         disturbance_channels: Literal["all", "rates"] | Sequence[bool] = "all",
         metric: Any = None,
         settings: task.CartPoleSettings | None = None,
+        compiled: bool = False,
         render_mode: str | None = None,
     ) -> None:
         """Build the environment; see the class for the arguments."""
@@ -92,9 +96,12 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
                 f"{self.metadata['render_modes']} or None"
             )
         self.settings = settings or task.CartPoleSettings()
+        self._hold = HeldStep(self.settings.system, self.settings.control_period, compiled)
+        self._steps = self.settings.steps
         self.disturbance = Disturbance(
             disturbance, disturbance_bound, channel_mask(disturbance_channels, task.RATES), metric
         )
+        self._feedback = self.disturbance.is_feedback
         self.named_space = task.named_space(self.settings)
         self.observation_space = cast(
             "spaces.Space[NDArray[np.float32]]", spaces.flatten_space(self.named_space)
@@ -128,7 +135,7 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.scenario = task.scenario_from_options(options, drawn)
         self.nominal = task.nominal_from_options(options, self.settings)
         self._pushes = self.disturbance.realise(
-            streams.disturbance, self.settings.steps, self.settings.control_period
+            streams.disturbance, self._steps, self.settings.control_period
         )
         if self.disturbance.kind == "worst" and self.nominal is None:
             raise ValueError(
@@ -137,18 +144,20 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             )
         self._state: tuple[float, ...] = tuple(self.scenario.initial_state.tolist())
         self._goal: tuple[float, ...] = tuple(self.scenario.goal.tolist())
-        self._constant_part = np.concatenate([self.scenario.goal, self.scenario.initial_state])
+        # What stays the same in every observation of the episode.
+        self._blank = np.zeros(task.OBSERVATION_DIM, np.float32)
+        self._blank[task.GOAL] = self.scenario.goal
+        self._blank[task.INITIAL_STATE] = self.scenario.initial_state
         self._step = 0
         self._effort = 0.0
         self._effort_to_success = 0.0
         self._success_time = math.inf
         self._push = np.zeros(task.STATE_DIM)
         self._started = True
-        distance = task.goal_distance(self._state, self._goal, math.sqrt)
-        self._note_success(distance, fallen=False)
+        arrival = self._note_arrival(fallen=False)
         if self.render_mode == "human":
             self.render()
-        return self._observation(), self._info(distance, fallen=False)
+        return self._observation(), self._info(arrival, fallen=False)
 
     def step(
         self, action: NDArray[np.float32]
@@ -167,22 +176,21 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         if not self._started:
             raise RuntimeError("call reset() before step()")
-        force = self._force(action)
         settings = self.settings
-        push = self._current_push()
-        integrated = self._advance(force, push)
-        self._push = push
+        force = self._force(action)
+        self._push = self._current_push()
+        integrated = self._advance(force)
         self._step += 1
         effort = force * force * settings.control_period
         self._effort += effort
         fallen = not integrated or abs(self._state[1]) > task.FALL_ANGLE
-        distance = task.goal_distance(self._state, self._goal, math.sqrt)
-        first_success = self._note_success(distance, fallen)
-        reward = float(task.reward(settings, effort, distance, first_success, fallen))
-        truncated = self._step >= settings.steps
+        arrival = self._note_arrival(fallen)
+        distance, _, _, first_success = arrival
+        reward: float = task.reward(settings, effort, distance, first_success, fallen)
         if self.render_mode == "human":
             self.render()
-        return self._observation(), reward, fallen, truncated, self._info(distance, fallen)
+        truncated = self._step >= self._steps
+        return self._observation(), reward, fallen, truncated, self._info(arrival, fallen)
 
     @property
     def state(self) -> FloatArray:
@@ -229,31 +237,35 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         values = np.asarray(action)
         if values.shape != (1,):
             raise ValueError(f"action has shape {values.shape}; it must be one number, shape (1,)")
-        value = float(values[0])
+        value = float(values.item())
         if not math.isfinite(value):
             raise ValueError(f"action={value!r} is not finite")
         force: float = task.applied_force(self.settings, value, _clip)
         return force
 
-    def _advance(self, force: float, push: FloatArray) -> bool:
+    def _advance(self, force: float) -> bool:
         """Move the state over one control step, and tell whether it could be integrated."""
-        settings = self.settings
         try:
-            following = rk4_hold(
-                settings.system, self._state, (force,), push.tolist(), settings.control_period, math
-            )
+            following = self._hold.run(*self._state, force, *self._push.tolist())
         except (OverflowError, ValueError):  # an infinity has no sine
             return False
-        # `not <=` also catches nan.
-        if any(not abs(part) <= task.LARGEST_STATE for part in following):
-            return False
-        self._state = tuple(following)
-        return True
+        p, angle, velocity, rate = following
+        largest = task.LARGEST_STATE
+        # A comparison with nan is false.
+        if (
+            -largest <= p <= largest
+            and -largest <= angle <= largest
+            and -largest <= velocity <= largest
+            and -largest <= rate <= largest
+        ):
+            self._state = following
+            return True
+        return False
 
     def _current_push(self) -> FloatArray:
         # Past the time limit (a caller who ignored `truncated`) the last push stays.
-        index = min(self._step, self.settings.steps - 1)
-        if not self.disturbance.is_feedback:
+        index = self._step if self._step < self._steps else self._steps - 1
+        if not self._feedback:
             return cast(FloatArray, self._pushes[index])
         nominal = None if self.nominal is None else self.nominal[self._nominal_index()]
         return self.disturbance.respond(
@@ -261,34 +273,39 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         )
 
     def _nominal_index(self) -> int:
-        return min(self._step, self.settings.steps)
+        return min(self._step, self._steps)
 
-    def _note_success(self, distance: float, fallen: bool) -> bool:
-        self._inside = not fallen and distance <= self.settings.tube.radius(self.time)
-        if math.isfinite(self._success_time):
-            return False
+    def _note_arrival(self, fallen: bool) -> tuple[float, float, bool, bool]:
+        """Return ||x - x_f||, r(t), whether x is inside the tube and whether for the first time."""
+        distance: float = task.goal_distance(self._state, self._goal, math.sqrt)
+        time = self._step * self.settings.control_period
+        radius: float = self.settings.tube.radius(time)
+        inside = not fallen and distance <= radius
+        if self._success_time != math.inf:
+            return distance, radius, inside, False
         self._effort_to_success = self._effort
-        if self._inside:
-            self._success_time = self.time
-        return self._inside
+        if inside:
+            self._success_time = time
+        return distance, radius, inside, inside
 
     def _observation(self) -> NDArray[np.float32]:
-        observation = np.empty(task.OBSERVATION_DIM, np.float32)
-        observation[task.STATE] = self._state
-        observation[4:12] = self._constant_part
-        observation[task.TIME] = self.time
+        observation = self._blank.copy()
+        # One by one: four floats become an array more slowly than they are stored.
+        observation[0], observation[1], observation[2], observation[3] = self._state
+        observation[task.TIME] = self._step * self.settings.control_period
         return observation
 
-    def _info(self, distance: float, fallen: bool) -> dict[str, Any]:
+    def _info(self, arrival: tuple[float, float, bool, bool], fallen: bool) -> dict[str, Any]:
+        distance, radius, inside, _ = arrival
         info = {
-            "success": math.isfinite(self._success_time),
+            "success": self._success_time != math.inf,
             "success_time": self._success_time,
-            "inside_tube": self._inside,
+            "inside_tube": inside,
             "fallen": fallen,
             "effort": self._effort,
             "effort_to_success": self._effort_to_success,
             "disturbance": self._push,
-            "tube_radius": self.settings.tube.radius(self.time),
+            "tube_radius": radius,
             "goal_distance": distance,
         }
         if self.nominal is not None:

@@ -98,11 +98,11 @@ class CartPoleSettings:
 
 @dataclass(frozen=True)
 class CartPoleScenario:
-    """What an episode asks for.
+    """What an episode asks for, or each of several episodes.
 
     Attributes:
-        initial_state: x(0), shape (4,).
-        goal: x_f, shape (4,).
+        initial_state: x(0), shape (..., 4).
+        goal: x_f, shape (..., 4).
     """
 
     initial_state: FloatArray
@@ -111,10 +111,20 @@ class CartPoleScenario:
 
 def sample_scenario(rng: np.random.Generator, settings: CartPoleSettings) -> CartPoleScenario:
     """Draw x(0) = [0, theta_0, 0, 0] and x_f = [p_f, 0, 0, 0]."""
-    angle, position = rng.uniform(-1.0, 1.0, size=2)
-    initial_state, goal = np.zeros(STATE_DIM), np.zeros(STATE_DIM)
-    initial_state[1] = settings.initial_angle * angle
-    goal[0] = settings.goal_range * position
+    return scenario_of_shares(draw_shares(rng), settings)
+
+
+def draw_shares(rng: np.random.Generator) -> FloatArray:
+    """Draw theta_0 and p_f, each as a share of its range in [-1, 1], shape (2,)."""
+    return rng.uniform(-1.0, 1.0, size=2)
+
+
+def scenario_of_shares(shares: FloatArray, settings: CartPoleSettings) -> CartPoleScenario:
+    """Return the scenarios of what `draw_shares` has drawn, shape (..., 2)."""
+    shape = (*shares.shape[:-1], STATE_DIM)
+    initial_state, goal = np.zeros(shape), np.zeros(shape)
+    initial_state[..., 1] = settings.initial_angle * shares[..., 0]
+    goal[..., 0] = settings.goal_range * shares[..., 1]
     return CartPoleScenario(initial_state, goal)
 
 
@@ -122,34 +132,41 @@ def scenario_from_options(options: dict[str, Any], drawn: CartPoleScenario) -> C
     """Replace the drawn scenario by what `reset(options=...)` states.
 
     Args:
-        options: May hold `initial_state` (4,) and `goal` ((4,), or p_f alone).
+        options: May hold `initial_state` (..., 4) and `goal` ((..., 4), or p_f alone, (...)).
         drawn: What to keep where the options are silent.
 
     Returns:
-        The scenario of the episode.
+        The scenario of the episode, or of each of several.
 
     Raises:
         ValueError: A value has the wrong shape, is not finite, or starts fallen.
     """
     initial_state, goal = drawn.initial_state, drawn.goal
+    shape = goal.shape
     if "initial_state" in options:
-        initial_state = _vector("initial_state", options["initial_state"])
-        if abs(initial_state[1]) > FALL_ANGLE:
+        initial_state = _finite("initial_state", options["initial_state"], shape)
+        angles = np.abs(initial_state[..., 1])
+        if np.any(angles > FALL_ANGLE):
             raise ValueError(
-                f"options['initial_state'] has angle {initial_state[1]:.3f} rad; "
+                f"options['initial_state'] has an angle of {np.max(angles):.3f} rad; "
                 "beyond pi/2 the pole has already fallen"
             )
     if "goal" in options:
-        value = options["goal"]
-        goal = _vector("goal", [value, 0.0, 0.0, 0.0] if np.ndim(value) == 0 else value)
+        if np.shape(options["goal"]) == shape[:-1]:
+            goal = np.zeros(shape)
+            goal[..., 0] = _finite("goal", options["goal"], shape[:-1])
+        else:
+            goal = _finite("goal", options["goal"], shape, shape[:-1])
     return CartPoleScenario(initial_state, goal)
 
 
-def _vector(name: str, value: Any) -> FloatArray:
-    vector = np.array(value, dtype=np.float64)
-    if vector.shape != (STATE_DIM,) or not np.all(np.isfinite(vector)):
-        raise ValueError(f"options[{name!r}]={value!r} must be {STATE_DIM} finite numbers")
-    return vector
+def _finite(name: str, value: Any, *shapes: tuple[int, ...]) -> FloatArray:
+    """Return a copy of the option in double precision; the first shape is the one it must have."""
+    array = np.array(value, dtype=np.float64)
+    if array.shape != shapes[0] or not np.all(np.isfinite(array)):
+        wanted = " or ".join(map(str, shapes))
+        raise ValueError(f"options[{name!r}]={value!r} must be finite numbers of shape {wanted}")
+    return array
 
 
 def nominal_from_options(
@@ -206,10 +223,27 @@ def applied_force(settings: CartPoleSettings, action: Any, clip: Any) -> Any:
 
 def goal_distance(state: Any, goal: Any, sqrt: Any) -> Any:
     """Return ||x - x_f|| from the components of both (floats or arrays)."""
-    total = 0.0
-    for here, there in zip(state, goal, strict=True):
-        total = total + (here - there) * (here - there)
-    return sqrt(total)
+    (p, angle, velocity, rate), (p_f, angle_f, velocity_f, rate_f) = state, goal
+    p, angle, velocity, rate = p - p_f, angle - angle_f, velocity - velocity_f, rate - rate_f
+    return sqrt(p * p + angle * angle + velocity * velocity + rate * rate)
+
+
+@dataclass(frozen=True)
+class StepMeasure:
+    """What a control step without a fall or a success comes to, from x at its end, u and x_f.
+
+    Attributes:
+        settings: The task.
+    """
+
+    settings: CartPoleSettings
+
+    def __call__(self, state: Any, control: Any, goal: Any, functions: Any) -> tuple[Any, Any, Any]:
+        """Return ||x - x_f||, ||u||^2 dt and the reward."""
+        (force,) = control
+        distance = goal_distance(state, goal, functions.sqrt)
+        effort = force * force * self.settings.control_period
+        return distance, effort, reward(self.settings, effort, distance, False, False)
 
 
 def reward(

@@ -8,7 +8,7 @@ larger. A feedback kind (`worst`, or any callable) looks at the state instead.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, cast
 
@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
-# (generator, steps, channels, control period [s]) -> sequence in the unit ball, (steps, channels).
-UnitSequence = Callable[[np.random.Generator, int, int, float], FloatArray]
 
 # Rounding must not carry a vector of norm one over the bound.
 _INSIDE = 1.0 - 4.0 * np.finfo(np.float64).eps
 _GUST_CORRELATION_TIME = 1.0  # [s]
 _GUST_SPREAD = 0.6  # stationary norm (root mean square) as a share of the bound, before clipping
 _SINUSOID_RATES = (0.5, 5.0)  # [rad/s]
+# Episodes that are worked on at once: what they draw then stays in the cache.
+_BLOCK = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +55,10 @@ def _rays(vectors: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     Returns:
         Shapes (..., 1), (..., n) and (..., 1); ones in place of the norm of a zero vector.
     """
-    largest = np.max(np.abs(vectors), axis=-1, keepdims=True)
+    largest = np.maximum.reduce(np.abs(vectors), axis=-1, keepdims=True)
     rays: FloatArray = vectors / np.where(largest > 0.0, largest, 1.0)
-    lengths = np.linalg.norm(rays, axis=-1, keepdims=True)
+    # What linalg.norm does, without its overhead.
+    lengths = np.sqrt(np.add.reduce(rays * rays, axis=-1, keepdims=True))
     return largest, rays, np.maximum(lengths, 1.0)
 
 
@@ -79,60 +80,98 @@ def onto_unit_sphere(vectors: FloatArray, fallback: FloatArray) -> FloatArray:
     return np.where(largest > 0.0, rays * (_INSIDE / lengths), fallback)
 
 
-def _directions(rng: np.random.Generator, count: int, channels: int) -> FloatArray:
+@dataclass(frozen=True)
+class OpenLoop:
+    """How an open-loop kind makes its sequences: draws per episode, arithmetic on all at once.
+
+    Attributes:
+        size: Numbers that an episode draws, from the control steps and the channels.
+        draw: Fills the numbers (size,) of one episode, from its generator and the steps.
+        sequence: From numbers (..., size), steps, channels and control period [s] to sequences in
+            the unit ball, (..., steps, channels).
+    """
+
+    size: Callable[[int, int], int]
+    draw: Callable[[np.random.Generator, FloatArray, int], None]
+    sequence: Callable[[FloatArray, int, int, float], FloatArray]
+
+    def realise(
+        self, rng: np.random.Generator, steps: int, channels: int, period: float
+    ) -> FloatArray:
+        """Return one sequence in the unit ball, shape (steps, channels); period in [s]."""
+        numbers = np.empty(self.size(steps, channels))
+        self.draw(rng, numbers, steps)
+        return self.sequence(numbers, steps, channels, period)
+
+
+def _draw_normals(rng: np.random.Generator, numbers: FloatArray, steps: int) -> None:
+    rng.standard_normal(out=numbers)
+
+
+def _directions(normals: FloatArray, count: int, channels: int) -> FloatArray:
     axis = np.zeros(channels)
     axis[0] = _INSIDE
-    return onto_unit_sphere(rng.standard_normal((count, channels)), axis)
+    return onto_unit_sphere(normals.reshape(*normals.shape[:-1], count, channels), axis)
 
 
-def _none(rng: np.random.Generator, steps: int, channels: int, period: float) -> FloatArray:
-    return np.zeros((steps, channels))
+def _none(numbers: FloatArray, steps: int, channels: int, period: float) -> FloatArray:
+    return np.zeros((*numbers.shape[:-1], steps, channels))
 
 
-def _uniform(rng: np.random.Generator, steps: int, channels: int, period: float) -> FloatArray:
-    directions = _directions(rng, steps, channels)
-    return directions * rng.random((steps, 1)) ** (1.0 / channels)
+def _draw_uniform(rng: np.random.Generator, numbers: FloatArray, steps: int) -> None:
+    rng.standard_normal(out=numbers[:-steps])
+    rng.random(out=numbers[-steps:])
 
 
-def _sphere(rng: np.random.Generator, steps: int, channels: int, period: float) -> FloatArray:
-    return _directions(rng, steps, channels)
+def _uniform(numbers: FloatArray, steps: int, channels: int, period: float) -> FloatArray:
+    directions = _directions(numbers[..., :-steps], steps, channels)
+    return directions * numbers[..., -steps:, None] ** (1.0 / channels)
 
 
-def _constant(rng: np.random.Generator, steps: int, channels: int, period: float) -> FloatArray:
-    return np.repeat(_directions(rng, 1, channels), steps, axis=0)
+def _constant(numbers: FloatArray, steps: int, channels: int, period: float) -> FloatArray:
+    return np.repeat(_directions(numbers, 1, channels), steps, axis=-2)
 
 
-def _sinusoid(rng: np.random.Generator, steps: int, channels: int, period: float) -> FloatArray:
-    direction = _directions(rng, 1, channels)
-    rate = rng.uniform(*_SINUSOID_RATES)
-    phase = rng.uniform(0.0, 2.0 * math.pi)
+def _draw_sinusoid(rng: np.random.Generator, numbers: FloatArray, steps: int) -> None:
+    rng.standard_normal(out=numbers[:-2])
+    numbers[-2] = rng.uniform(*_SINUSOID_RATES)
+    numbers[-1] = rng.uniform(0.0, 2.0 * math.pi)
+
+
+def _sinusoid(numbers: FloatArray, steps: int, channels: int, period: float) -> FloatArray:
+    direction = _directions(numbers[..., :-2], 1, channels)
+    rate, phase = numbers[..., -2, None, None], numbers[..., -1, None, None]
     times = period * np.arange(steps)[:, None]
     waves: FloatArray = direction * np.sin(rate * times + phase)
     return waves
 
 
-def _gust(rng: np.random.Generator, steps: int, channels: int, period: float) -> FloatArray:
+def _sphere(numbers: FloatArray, steps: int, channels: int, period: float) -> FloatArray:
+    return _directions(numbers, steps, channels)
+
+
+def _gust(numbers: FloatArray, steps: int, channels: int, period: float) -> FloatArray:
     # Exact discretisation of an Ornstein-Uhlenbeck process, begun in its stationary law.
     decay = math.exp(-period / _GUST_CORRELATION_TIME)
     spread = _GUST_SPREAD / math.sqrt(channels)
-    shocks = spread * rng.standard_normal((steps, channels))
+    shocks = spread * numbers.reshape(*numbers.shape[:-1], steps, channels)
     fresh = math.sqrt(1.0 - decay * decay)
     path = np.empty_like(shocks)
-    value = shocks[0]
-    path[0] = value
+    value = shocks[..., 0, :]
+    path[..., 0, :] = value
     for step in range(1, steps):
-        value = decay * value + fresh * shocks[step]
-        path[step] = value
+        value = decay * value + fresh * shocks[..., step, :]
+        path[..., step, :] = value
     return into_unit_ball(path)
 
 
-OPEN_LOOP: dict[str, UnitSequence] = {
-    "none": _none,
-    "uniform": _uniform,
-    "sphere": _sphere,
-    "constant": _constant,
-    "sinusoid": _sinusoid,
-    "gust": _gust,
+OPEN_LOOP: dict[str, OpenLoop] = {
+    "none": OpenLoop(lambda steps, channels: 0, _draw_normals, _none),
+    "uniform": OpenLoop(lambda steps, channels: steps * (channels + 1), _draw_uniform, _uniform),
+    "sphere": OpenLoop(lambda steps, channels: steps * channels, _draw_normals, _sphere),
+    "constant": OpenLoop(lambda steps, channels: channels, _draw_normals, _constant),
+    "sinusoid": OpenLoop(lambda steps, channels: channels + 2, _draw_sinusoid, _sinusoid),
+    "gust": OpenLoop(lambda steps, channels: steps * channels, _draw_normals, _gust),
 }
 KINDS = (*OPEN_LOOP, "worst")
 
@@ -220,13 +259,38 @@ class Disturbance:
             Shape (steps, n). For an open-loop kind d at every step, of norm at most the bound; for
             a feedback kind the unit direction of the episode, to be passed to `respond`.
         """
-        mask = np.asarray(self.channels)
-        count = int(mask.sum())
+        sequence = np.empty((steps, len(self.channels)))
+        self.realise_all([rng], sequence[None], period)
+        return sequence
+
+    def realise_all(
+        self, generators: Iterable[np.random.Generator], sequences: FloatArray, period: float
+    ) -> None:
+        """Draw the disturbances of many episodes, each as `realise` draws it.
+
+        Args:
+            generators: The disturbance stream of each episode; each is done with before the next.
+            sequences: Where to write, shape (episodes, steps, n).
+            period: Control period [s].
+        """
         # A feedback kind draws no sequence; its episode only needs one direction.
-        draw = _constant if self.is_feedback else OPEN_LOOP[cast(str, self.kind)]
-        sequence = np.zeros((steps, mask.size))
-        sequence[:, mask] = draw(rng, steps, count, period)
-        return sequence if self.is_feedback else self.bound * sequence
+        kind = OPEN_LOOP["constant" if self.is_feedback else cast(str, self.kind)]
+        bound = 1.0 if self.is_feedback else self.bound
+        episodes, steps, _ = sequences.shape
+        disturbed = np.flatnonzero(self.channels)
+        numbers = np.empty((min(episodes, _BLOCK), kind.size(steps, disturbed.size)))
+        streams = iter(generators)
+        for begin in range(0, episodes, _BLOCK):
+            block = sequences[begin : begin + _BLOCK]
+            drawn = numbers[: len(block)]
+            for row in drawn:
+                kind.draw(next(streams), row, steps)
+            scaled = bound * kind.sequence(drawn, steps, disturbed.size, period)
+            if disturbed.size < len(self.channels):
+                block[:] = 0.0
+                block[..., disturbed] = scaled
+            else:
+                block[:] = scaled
 
     def respond(self, situation: Situation) -> FloatArray:
         """Return d of a feedback kind, shape (..., n), of norm at most the bound.

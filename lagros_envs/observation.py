@@ -131,15 +131,18 @@ def observe(world: SpacecraftWorld, layout: Layout) -> Float32Array:
     observation[..., at["time"].start] = np.minimum(world.time, layout.time_limit)[:, None]
     radius = world.settings.sensing_radius
     if world.agents > 1:
-        others = _others(world.agents)
-        across, up = (part[:, others] - part[:, :, None] for part in (x, y))
+        places = _places_of_others(world.worlds, world.agents)
+        across, up, *rates = (
+            part.reshape(-1).take(places) - part[:, :, None]
+            for part in (x, y, velocity_x, velocity_y)
+        )
         sensed = (across * across + up * up <= radius**2).astype(np.float32)
         observation[..., at["neighbour_mask"]] = sensed
         slots = observation[..., at["neighbours"]].reshape(*shape, -1, NEIGHBOUR_DIM)
         _fill(slots[..., 0], across, sensed)
         _fill(slots[..., 1], up, sensed)
-        for index, part in enumerate((velocity_x, velocity_y), start=2):
-            _fill(slots[..., index], part[:, others] - part[:, :, None], sensed)
+        for index, rate in enumerate(rates, start=2):
+            _fill(slots[..., index], rate, sensed)
     if world.obstacles:
         # -inf where there is no obstacle: its reach must not count.
         reach = np.maximum(world.obstacle_radii + radius, -1.0)
@@ -163,12 +166,13 @@ def _fill(slot: Float32Array, values: FloatArray, sensed: Float32Array) -> None:
     np.multiply(values.astype(np.float32), sensed, out=slot)
 
 
-@lru_cache(maxsize=32)
-def _others(agents: int) -> NDArray[np.intp]:
-    """Return for each agent the indices of all others, shape (agents, agents - 1)."""
+@lru_cache(maxsize=8)
+def _places_of_others(worlds: int, agents: int) -> NDArray[np.intp]:
+    """Return where in (worlds * agents,) the others of each agent are, (worlds, agents, others)."""
     own = np.arange(agents)[:, None]
     index = np.arange(agents - 1)[None]
-    return np.asarray(index + (index >= own), np.intp)
+    others = np.asarray(index + (index >= own), np.intp)
+    return agents * np.arange(worlds)[:, None, None] + others
 
 
 def named_state_space(agents: int, obstacles: int, time_limit: float) -> spaces.Dict:

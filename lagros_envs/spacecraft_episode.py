@@ -34,6 +34,7 @@ class SpacecraftEpisode:
         metric: As in `SpacecraftParallelEnv`.
         settings: The task.
         worlds: Number of worlds.
+        compiled: Whether numba compiles the equation of motion.
 
     Raises:
         ValueError: A setting is not valid.
@@ -49,6 +50,7 @@ class SpacecraftEpisode:
         metric: Any,
         settings: task.SpacecraftSettings | None,
         worlds: int = 1,
+        compiled: bool = False,
     ) -> None:
         """Build the worlds."""
         self.settings = settings or task.SpacecraftSettings()
@@ -62,6 +64,7 @@ class SpacecraftEpisode:
             self.preset.obstacle_count[1],
             self.disturbance,
             self.settings,
+            compiled,
         )
         self.layout = Layout.of(self.world)
         self.started = False

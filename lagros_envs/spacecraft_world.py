@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
 from lagros_envs.disturbances import Disturbance, Situation
-from lagros_envs.dynamics.integrate import rk4_hold
+from lagros_envs.dynamics.held import HeldBatch
 from lagros_envs.scenarios import Scenario
 from lagros_envs.sweep import Path, swept_agents, swept_obstacles
 
@@ -53,6 +53,7 @@ class SpacecraftWorld:
         obstacles: Most obstacles that a world can hold.
         disturbance: The disturbance; every agent has its own realisation.
         settings: The task.
+        compiled: Whether numba compiles the equation of motion, see `dynamics.held.HeldBatch`.
     """
 
     def __init__(
@@ -62,12 +63,14 @@ class SpacecraftWorld:
         obstacles: int,
         disturbance: Disturbance,
         settings: task.SpacecraftSettings,
+        compiled: bool = False,
     ) -> None:
         """Allocate the worlds; `begin` starts them."""
         self.worlds, self.agents, self.obstacles = worlds, agents, obstacles
         self.disturbance, self.settings = disturbance, settings
-        self._by_wrench = settings.system.by_wrench
         shape = (worlds, agents)
+        substep = settings.control_period / SUBSTEPS
+        self._hold = HeldBatch(settings.system.by_wrench, substep, shape, compiled, 1)
         self.parts = np.zeros((task.STATE_DIM, *shape))
         self.goals = np.zeros((2, *shape))
         self.start_headings = np.zeros(shape)
@@ -175,8 +178,11 @@ class SpacecraftWorld:
         settings = self.settings
         going = np.ones(self.worlds, bool) if moving is None else moving
         before = self.goal_distance
-        control = np.ascontiguousarray(np.moveaxis(forces, -1, 0)) * going[:, None]
-        self.push = self._current_push() * going[:, None]
+        control = np.array(np.moveaxis(forces, -1, 0), order="C")
+        self.push = self._current_push()
+        if moving is not None:
+            control *= going[:, None]
+            self.push *= going[:, None]
         path, integrated = self._advance(control, going)
         effort = np.einsum("uwa,uwa->wa", control, control) * settings.control_period
         self.forces = control
@@ -194,8 +200,10 @@ class SpacecraftWorld:
         rewards = task.reward(settings, effort, before - after, first_success, first_collision)
         over = going & np.all(self.collided, axis=1)
         late = going & (self.step_count >= settings.steps)
+        if moving is not None:
+            rewards = np.where(going[:, None], rewards, 0.0)
         return Outcome(
-            np.where(going[:, None], rewards, 0.0),
+            rewards,
             np.repeat(over[:, None], self.agents, axis=1),
             np.repeat(late[:, None], self.agents, axis=1),
         )
@@ -252,18 +260,19 @@ class SpacecraftWorld:
         return self.obstacle_radii + self.core_radius[:, None]
 
     def _current_push(self) -> FloatArray:
+        """Return d of this step, a new array (6, worlds, agents)."""
         # Past the time limit (a caller who ignored `truncated`) the last push stays.
         index = np.minimum(self.step_count, self.settings.steps - 1)
         push = np.moveaxis(self._pushes[self._everywhere, index], 1, 0)
         if not self.disturbance.is_feedback:
-            return np.ascontiguousarray(push)
+            return np.array(push, order="C")
         situation = Situation(
             self.states,
             self.nominal_now(),
             np.repeat(self.time[:, None], self.agents, axis=1),
             np.moveaxis(push, 0, -1),
         )
-        return np.ascontiguousarray(np.moveaxis(self.disturbance.respond(situation), -1, 0))
+        return np.array(np.moveaxis(self.disturbance.respond(situation), -1, 0), order="C")
 
     def _advance(self, control: FloatArray, going: BoolArray) -> tuple[Path, BoolArray]:
         """Move the states over one control step, and tell which could be integrated."""
@@ -274,15 +283,12 @@ class SpacecraftWorld:
         # leaves its chord by at most a h^2 / 8.
         acceleration = _length(wrench[0], wrench[1]) / self.settings.system.mass
         bulge = (acceleration + _length(self.push[3], self.push[4])) * (duration**2 / 8.0)
-        parts = self.parts
-        points[0] = parts[:2]
-        push = list(self.push)
+        points[0] = self.parts[:2]
         with np.errstate(over="ignore", invalid="ignore"):
-            for substep in range(SUBSTEPS):
-                following = np.stack(
-                    rk4_hold(self._by_wrench, list(parts), wrench, push, duration, np, 1)
-                )
-                parts = following
+            parts = self._hold(self.parts, wrench, self.push)
+            points[1] = parts[:2]
+            for substep in range(1, SUBSTEPS):
+                parts = self._hold.go_on(parts)
                 points[substep + 1] = parts[:2]
             integrated = np.all(np.abs(parts) <= task.LARGEST_STATE, axis=0)
         kept = integrated & going[:, None]
@@ -291,7 +297,7 @@ class SpacecraftWorld:
             parts = np.where(kept, parts, self.parts)
             points = np.where(kept, points, points[:1])
             bulge = np.where(kept, bulge, 0.0)
-        self.parts = parts
+        self.parts = parts.copy()
         return Path.through(points, bulge), integrated
 
     def _note_arrivals(self, distance: FloatArray, worlds: BoolArray) -> BoolArray:

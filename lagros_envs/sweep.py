@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
 
 
 class Path(NamedTuple):
@@ -48,12 +50,14 @@ def swept_agents(path: Path, contact: FloatArray) -> BoolArray:
     hit = np.zeros((worlds, agents), bool)
     if agents == 1:
         return hit
-    first, second = np.triu_indices(agents, 1)
-    x, y = points[-1]
+    first, second, places, other_places = _pairs(worlds, agents)
+    x, y, reaches = (part.reshape(-1) for part in (*points[-1], reach))
     # Who is further apart at the end than both have moved and need cannot have met.
-    square = (x[:, second] - x[:, first]) ** 2 + (y[:, second] - y[:, first]) ** 2
-    near = square <= (reach[:, first] + reach[:, second] + contact[:, None]) ** 2
-    world, pair = np.nonzero(near)
+    square = np.square(x.take(other_places) - x.take(places))
+    square += np.square(y.take(other_places) - y.take(places))
+    limit = reaches.take(places) + reaches.take(other_places)
+    limit += contact[:, None]
+    world, pair = np.nonzero(square <= np.square(limit, out=limit))
     if world.size:
         one, other = first[pair], second[pair]
         offsets = points[:, :, world, other] - points[:, :, world, one]
@@ -79,16 +83,29 @@ def swept_obstacles(path: Path, centres: FloatArray, contact: FloatArray) -> Boo
     points, bulge, reach = path
     hit = np.zeros(bulge.shape, bool)
     x, y = points[-1]
-    square = (x[:, :, None] - centres[0, :, None]) ** 2
-    square += (y[:, :, None] - centres[1, :, None]) ** 2
+    square = x[:, :, None] - centres[0, :, None]
+    square *= square
+    offset = y[:, :, None] - centres[1, :, None]
+    offset *= offset
+    square += offset
     # An absent obstacle has the contact -inf; its square must not count.
-    limit = reach[:, :, None] + contact[:, None]
-    world, agent, obstacle = np.nonzero(square <= np.square(np.maximum(limit, 0.0)))
+    limit = np.add(reach[:, :, None], contact[:, None], out=offset)
+    np.maximum(limit, 0.0, out=limit)
+    limit *= limit
+    world, agent, obstacle = np.nonzero(square <= limit)
     if world.size:
         offsets = points[:, :, world, agent] - centres[:, world, obstacle]
         met = closest_approach(offsets) < contact[world, obstacle] + bulge[world, agent]
         hit[world[met], agent[met]] = True
     return hit
+
+
+@lru_cache(maxsize=8)
+def _pairs(worlds: int, agents: int) -> tuple[IntArray, ...]:
+    """Return the two agents of each pair, and where they are in (worlds * agents,)."""
+    first, second = np.triu_indices(agents, 1)
+    begin = agents * np.arange(worlds)[:, None]
+    return first, second, begin + first, begin + second
 
 
 def closest_approach(offsets: FloatArray) -> FloatArray:

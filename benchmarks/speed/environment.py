@@ -36,8 +36,8 @@ def _single(scale: Scale) -> Section:
     theirs = gym.make(_THEIRS)
     steps = interleave(
         {
-            _OURS: _stepping(ours, np.zeros(1, np.float32), scale.calls),
-            _THEIRS: _stepping(theirs, 0, scale.calls),
+            _OURS: stepping(ours, np.zeros(1, np.float32), scale.calls),
+            _THEIRS: stepping(theirs, 0, scale.calls),
         },
         scale.rounds,
     )
@@ -52,7 +52,7 @@ def _single(scale: Scale) -> Section:
     return Section(
         "One environment, from gym.make",
         [
-            *_rows("step", {name: _returned(times) for name, times in steps.items()}),
+            *_rows("step", {name: returned(times) for name, times in steps.items()}),
             *_rows("reset", resets),
         ],
         notes=[
@@ -73,8 +73,8 @@ def _vector(scale: Scale) -> Section:
     rounds = max(scale.rounds // 10, 2)
     episodes = interleave(
         {
-            _OURS: _episode(ours, lambda observations: lqr.predict(observations)[0]),
-            _THEIRS: _episode(theirs, lambda _: choices),
+            _OURS: episode(ours, lambda observations: lqr.predict(observations)[0]),
+            _THEIRS: episode(theirs, lambda _: choices),
         },
         rounds,
     )
@@ -100,7 +100,7 @@ def _vector(scale: Scale) -> Section:
     )
 
 
-def _stepping(env: gym.Env[Any, Any], action: Any, calls: int) -> Candidate:
+def stepping(env: gym.Env[Any, Any], action: Any, calls: int) -> Candidate:
     """Return what steps through episodes and returns the mean time of a step alone [s]."""
     env.reset(seed=_SEED)
 
@@ -117,7 +117,7 @@ def _stepping(env: gym.Env[Any, Any], action: Any, calls: int) -> Candidate:
     return steps
 
 
-def _episode(env: gym.vector.VectorEnv[Any, Any, Any], act: Actions) -> Candidate:
+def episode(env: gym.vector.VectorEnv[Any, Any, Any], act: Actions) -> Candidate:
     """Return what runs an episode of all worlds and returns the time of every step [s]."""
 
     def steps(index: int) -> list[float]:
@@ -133,7 +133,7 @@ def _episode(env: gym.vector.VectorEnv[Any, Any, Any], act: Actions) -> Candidat
     return steps
 
 
-def _returned(times: Times) -> Times:
+def returned(times: Times) -> Times:
     """Take the time that a candidate measured itself for that around it."""
     return Times(np.array(times.results), [], single=False)
 

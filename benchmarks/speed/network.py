@@ -115,7 +115,7 @@ def _onnx_peer(network: Mlp, features: Float32Array) -> Candidate:
 def _predict(scale: Scale) -> Section:
     env = gym.make("lagros/CartPole-v0", **_DISTURBANCE)
     observation, _ = env.reset(seed=_SEED)
-    policy, source = _lagros_policy()
+    policy, source = shipped_policy()
     features, _ = cartpole_features(observation)
     candidates: dict[str, Candidate] = {
         "LagrosPolicy.predict": lambda _: policy.predict(observation),
@@ -124,7 +124,7 @@ def _predict(scale: Scale) -> Section:
     }
     sb3 = importlib.util.find_spec("stable_baselines3") is not None
     if sb3:
-        candidates["PPO.predict (SB3), 3x100"] = _ppo_peer(env, observation)
+        candidates["PPO.predict (SB3), 3x100"] = ppo_peer(env, observation)
     times = interleave(candidates, scale.rounds, scale.calls)
     reference = times["LagrosPolicy.predict"]
     rows = [timed_row(name, taken, reference) for name, taken in times.items()]
@@ -138,7 +138,8 @@ def _predict(scale: Scale) -> Section:
     )
 
 
-def _lagros_policy() -> tuple[LagrosPolicy, str]:
+def shipped_policy() -> tuple[LagrosPolicy, str]:
+    """Return policy (c) and where its weights come from."""
     shipped = PRETRAINED / LagrosPolicy.weights_file
     if shipped.is_file():
         return LagrosPolicy(), "Shipped weights"
@@ -148,7 +149,8 @@ def _lagros_policy() -> tuple[LagrosPolicy, str]:
         return LagrosPolicy(weights=path), "Random weights, as none are shipped"
 
 
-def _ppo_peer(env: gym.Env[Any, Any], observation: Float32Array) -> Candidate:
+def ppo_peer(env: gym.Env[Any, Any], observation: Float32Array) -> Candidate:
+    """Return `predict` of an untrained PPO of stable-baselines3 with an actor like ours."""
     from stable_baselines3 import PPO
 
     model = PPO("MlpPolicy", env, policy_kwargs={"net_arch": list(_HIDDEN)}, device="cpu")

@@ -23,7 +23,7 @@ WIDTH = 80
 # Above this load another process competes for a core of the two that this project is measured on.
 QUIET_LOAD = 1.2
 _UNITS = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6))
-_PEERS = ("casadi", "cvxpy", "onnxruntime")
+_PEERS = ("casadi", "cvxpy", "onnxruntime", "numba")
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """Speed against peers, side by side in one process: python benchmarks/speed/run.py [--quick].
 
 Prints one table per topic and the targets with what was measured. The whole run takes a few
-minutes; start it on an idle machine. casadi is the only peer that lagros does not need itself
-(`pip install -e ".[speed]"`, or `make speed`); onnxruntime takes part where it is installed.
+minutes; start it on an idle machine. The topic `ratios` alone prints how many times as fast as its
+peers lagros is. casadi is the only peer that lagros does not need itself (`pip install -e
+".[speed]"`, or `make speed`); onnxruntime and numba take part where they are installed.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE.parent / "results" / "speed.json"
-TOPICS = ("planner", "sdp", "network", "environment")
+RATIOS = HERE.parent / "results" / "speed_ratios.json"
+TOPICS = ("planner", "sdp", "network", "environment", "ratios")
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 
 
@@ -49,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     report.print_targets(console, sections)
     report.print_versions(console, found)
     console.print(f"Took {time.perf_counter() - begun:.0f} s.", style="dim")
-    path = options.json or (None if options.quick or options.topics else RESULTS)
+    path = options.json or (None if options.quick else _published(options.topics))
     if path is not None:
         command = shlex.join(["python", "benchmarks/speed/run.py", *(arguments or sys.argv[1:])])
         console.print(f"Wrote {report.write_json(path, sections, found, command)}")
@@ -59,14 +61,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__.partition("\n\n")[0],
-        epilog=f"A complete run writes {RESULTS.relative_to(HERE.parents[1])}; --quick and a "
-        "choice of topics write a file only with --json.",
+        epilog=f"A complete run writes {RESULTS.relative_to(HERE.parents[1])}, the topic ratios "
+        f"alone {RATIOS.name} beside it; --quick and other choices write a file only with --json.",
     )
     # No `choices`: argparse would check the empty list against them.
     parser.add_argument("topics", nargs="*", type=_topic, help=f"some of {', '.join(TOPICS)}")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions: about a minute")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the report as JSON")
     return parser
+
+
+def _published(topics: Sequence[str]) -> Path | None:
+    """Return the file that a complete run of these topics renews."""
+    if not topics:
+        return RESULTS
+    return RATIOS if list(topics) == ["ratios"] else None
 
 
 def _topic(name: str) -> str:

@@ -58,7 +58,9 @@ def episodes(expert: CartPoleExpert, count: int) -> tuple[TrackedPlans, FloatArr
             raise RuntimeError(f"episode {seed} has no plan: {plan.status}")
         plans.append(plan)
         pushes.append(
-            OPEN_LOOP["uniform"](streams.disturbance, settings.steps, 4, settings.control_period)
+            OPEN_LOOP["uniform"].realise(
+                streams.disturbance, settings.steps, 4, settings.control_period
+            )
         )
     states = np.stack([plan.states for plan in plans])
     controls = np.stack([plan.controls for plan in plans])

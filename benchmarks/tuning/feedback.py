@@ -93,7 +93,7 @@ def plan_episodes(
 
 def pushes(rng: np.random.Generator, shape: tuple[int, ...], period: float) -> FloatArray:
     """Draw uniform disturbances of the bound, shape (*shape, 4)."""
-    drawn = OPEN_LOOP["uniform"](rng, int(np.prod(shape)), task.STATE_DIM, period)
+    drawn = OPEN_LOOP["uniform"].realise(rng, int(np.prod(shape)), task.STATE_DIM, period)
     return _BOUND * drawn.reshape(*shape, task.STATE_DIM)
 
 

@@ -2,6 +2,7 @@
 
 `cartpole` and `spacecraft` hold the physics; `dual` differentiates it; `integrate` holds a control
 over one step; `system` derives drift, control matrix, Jacobians and the SDC matrix for any system.
+`straight_line`, `held` and `compiled` run a held step without the overhead of calling the two.
 """
 
 from lagros_envs.dynamics.cartpole import CartPole

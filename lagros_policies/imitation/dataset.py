@@ -19,6 +19,7 @@ from lagros_envs import cartpole_task as task
 from lagros_envs.disturbances import OPEN_LOOP, into_unit_ball
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
+from lagros_policies.backends import LOKY, Backend
 from lagros_policies.contraction import Metric
 from lagros_policies.expert import CartPoleExpert, TrackedPlans
 from lagros_policies.imitation.shards import Shard, make_shards
@@ -114,6 +115,7 @@ def generate(
     task_settings: task.CartPoleSettings | None = None,
     jobs: int = 1,
     on_shard: Callable[[int], None] | None = None,
+    backend: Backend = LOKY,
 ) -> ExpertData:
     """Generate expert data, or finish what an interrupted call began.
 
@@ -124,6 +126,7 @@ def generate(
         task_settings: The task.
         jobs: Processes.
         on_shard: Called with the number of shards that are finished.
+        backend: Whose processes they are.
 
     Returns:
         All samples, in an order that does not depend on the processes.
@@ -134,7 +137,7 @@ def generate(
     task_settings = task_settings or task.CartPoleSettings()
     make = partial(make_shard, metric=metric, settings=settings, task_settings=task_settings)
     record = _record(metric, settings, task_settings)
-    return _join(make_shards(folder, settings.shards, make, record, jobs, on_shard))
+    return _join(make_shards(folder, settings.shards, make, record, jobs, on_shard, backend))
 
 
 def make_shard(
@@ -218,7 +221,9 @@ def tube_states(
     bound: FloatArray = settings.disturbance_bound * rng.random((plans, 1, 1))
     pushes = np.stack(
         [
-            OPEN_LOOP[_KINDS[rng.integers(len(_KINDS))]](rng, steps, states.shape[-1], period)
+            OPEN_LOOP[_KINDS[rng.integers(len(_KINDS))]].realise(
+                rng, steps, states.shape[-1], period
+            )
             for _ in range(plans)
         ]
     )

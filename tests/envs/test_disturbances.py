@@ -314,3 +314,14 @@ def test_unit_ball_projection_is_the_nearest_point(vector):
     projected = into_unit_ball(vector)
     nearest = vector / max(1.0, norms(vector))
     np.testing.assert_allclose(projected, nearest, rtol=1e-12, atol=1e-300)
+
+
+@pytest.mark.parametrize("kind", [*sorted(OPEN_LOOP), "worst"])
+@pytest.mark.parametrize("channels", [(True,) * 4, (False, True, False, True)])
+def test_disturbances_of_many_episodes_are_those_of_each(kind, channels):
+    disturbance = Disturbance(kind, 0.7, channels, metric=np.eye(4))
+    many = np.full((70, 9, 4), np.nan)  # more than are worked on at once
+    disturbance.realise_all(map(np.random.default_rng, range(70)), many, PERIOD)
+    for seed, found in enumerate(many):
+        expected = disturbance.realise(np.random.default_rng(seed), 9, PERIOD)
+        np.testing.assert_array_equal(found, expected)

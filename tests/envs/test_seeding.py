@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 
 from lagros_envs.cartpole import CartPoleEnv
 from lagros_envs.disturbances import OPEN_LOOP
-from lagros_envs.seeding import EVALUATION, Streams, episode_seeds, episode_streams
+from lagros_envs.seeding import (
+    EVALUATION,
+    Streams,
+    episode_seeds,
+    episode_streams,
+    seeded_streams,
+)
 
 seeds = st.integers(0, 2**63 - 1)
 
@@ -62,6 +68,19 @@ def test_the_streams_of_a_seed_repeat_and_differ(seed):
     for ours, theirs in zip(draws, second, strict=True):
         np.testing.assert_array_equal(ours, theirs.random(8))
     assert len(np.unique(np.concatenate(draws))) == 24
+
+
+@pytest.mark.parametrize(("place", "stream"), [(0, "scenario"), (1, "disturbance"), (2, "policy")])
+@given(st.lists(st.integers(0, 2**66), max_size=5), st.integers(0, 2**64 - 1))
+def test_streams_of_many_episodes_are_those_of_each(place, stream, many, last):
+    # Against NumPy's own way of splitting a seed, which the batch does not take.
+    chosen = [*many, 0, 2**32, last]
+    for seed, found in zip(chosen, seeded_streams(chosen, stream), strict=True):
+        child = np.random.SeedSequence(seed).spawn(3)[place]
+        expected = np.random.default_rng(child)
+        assert found.bit_generator.state == expected.bit_generator.state
+        np.testing.assert_array_equal(found.standard_normal(3), expected.standard_normal(3))
+    assert list(seeded_streams([], stream)) == []
 
 
 def test_what_one_stream_draws_does_not_move_another():

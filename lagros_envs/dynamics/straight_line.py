@@ -1,0 +1,329 @@
+"""Records the arithmetic of a function once and runs it again without the function's overhead.
+
+Physics and integrator are written for any kind of number. Called with `Recorded` numbers they leave
+the list of their operations on a `Tape`. The list is run on floats, as Python source
+(`scalar_source`), on arrays, in fixed buffers (`ArrayFunction`), or compiled (`compiled`). Nothing
+is reordered, so that every result has the bits that calling the function would give.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.dynamics.integrate import SUBSTEPS, rk4_hold
+from lagros_envs.dynamics.system import System
+
+FloatArray = NDArray[np.float64]
+
+_UFUNCS: dict[str, Any] = {
+    "+": np.add,
+    "-": np.subtract,
+    "*": np.multiply,
+    "/": np.divide,
+    "sin": np.sin,
+    "cos": np.cos,
+    "sqrt": np.sqrt,
+    "abs": np.absolute,
+}
+# What the sources that are written here begin with.
+IMPORTS = "from math import cos, sin, sqrt"
+# (x, u, given, functions) -> what else to compute from the state at the end of a step.
+Measure = Callable[[Sequence[Any], Sequence[Any], Sequence[Any], Any], Sequence[Any]]
+
+
+class Operation(NamedTuple):
+    """One operation; its result is called `%i` for its place i on the tape.
+
+    Attributes:
+        symbol: `+`, `-`, `*`, `/`, `sin`, `cos`, `sqrt` or `abs`.
+        operands: Names of inputs, results, or the text of a constant.
+    """
+
+    symbol: str
+    operands: tuple[str, ...]
+
+
+class Tape:
+    """Operations in the order in which they were recorded, equal ones only once."""
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self.operations: list[Operation] = []
+        self._known: dict[Operation, Recorded] = {}
+
+    def record(self, symbol: str, *operands: Any) -> Recorded:
+        """Note an operation and return its result.
+
+        Raises:
+            TypeError: An operand is neither a `Recorded` nor a finite number.
+        """
+        operation = Operation(symbol, tuple(map(_text, operands)))
+        if operation not in self._known:
+            self._known[operation] = Recorded(self, f"%{len(self.operations)}")
+            self.operations.append(operation)
+        return self._known[operation]
+
+
+class Recorded:
+    """A number whose operations go onto a tape; it has no value to branch on.
+
+    Attributes:
+        tape: Where they go.
+        name: Name of the number on the tape.
+    """
+
+    __slots__ = ("name", "tape")
+
+    def __init__(self, tape: Tape, name: str) -> None:
+        """Name a number."""
+        self.tape, self.name = tape, name
+
+    def __add__(self, other: Any) -> Recorded:
+        """Record a sum."""
+        return self.tape.record("+", self, other)
+
+    def __radd__(self, other: Any) -> Recorded:
+        """Record a sum with a constant on the left."""
+        return self.tape.record("+", other, self)
+
+    def __sub__(self, other: Any) -> Recorded:
+        """Record a difference."""
+        return self.tape.record("-", self, other)
+
+    def __rsub__(self, other: Any) -> Recorded:
+        """Record a difference with a constant on the left."""
+        return self.tape.record("-", other, self)
+
+    def __mul__(self, other: Any) -> Recorded:
+        """Record a product."""
+        return self.tape.record("*", self, other)
+
+    def __rmul__(self, other: Any) -> Recorded:
+        """Record a product with a constant on the left."""
+        return self.tape.record("*", other, self)
+
+    def __truediv__(self, other: Any) -> Recorded:
+        """Record a quotient."""
+        return self.tape.record("/", self, other)
+
+    def __rtruediv__(self, other: Any) -> Recorded:
+        """Record a quotient with a constant on the left."""
+        return self.tape.record("/", other, self)
+
+    def __abs__(self) -> Recorded:
+        """Record an absolute value."""
+        return self.tape.record("abs", self)
+
+    def __bool__(self) -> bool:
+        """Refuse: what is recorded may not branch."""
+        raise TypeError("an equation of motion must not branch on its state: it is recorded once")
+
+
+class Recording:
+    """The elementary functions of `Recorded` numbers, as a namespace for `System.derivative`."""
+
+    @staticmethod
+    def sin(x: Recorded) -> Recorded:
+        """Record a sine."""
+        return x.tape.record("sin", x)
+
+    @staticmethod
+    def cos(x: Recorded) -> Recorded:
+        """Record a cosine."""
+        return x.tape.record("cos", x)
+
+    @staticmethod
+    def sqrt(x: Recorded) -> Recorded:
+        """Record a square root."""
+        return x.tape.record("sqrt", x)
+
+
+class StraightLine(NamedTuple):
+    """A function as a list of operations.
+
+    Attributes:
+        inputs: Names of the arguments.
+        operations: The operations that the outputs need, as `Operation` describes them.
+        outputs: Names of what is returned.
+    """
+
+    inputs: tuple[str, ...]
+    operations: dict[str, Operation]
+    outputs: tuple[str, ...]
+
+    @property
+    def last_uses(self) -> dict[str, int]:
+        """For each name the place of the last operation that needs it; outputs are not freed."""
+        last: dict[str, int] = {}
+        for place, operation in enumerate(self.operations.values()):
+            last.update(dict.fromkeys(operation.operands, place))
+        last.update(dict.fromkeys(self.outputs, len(self.operations)))
+        return last
+
+
+def straight_line(
+    function: Callable[[Sequence[Recorded]], Sequence[Any]], inputs: Sequence[str]
+) -> StraightLine:
+    """Record a function of numbers.
+
+    Args:
+        function: Maps recorded numbers, one per input, to its results.
+        inputs: Names of the inputs.
+
+    Returns:
+        Its operations, without those that no result needs.
+
+    Raises:
+        TypeError: The function branches on its arguments, or works with something else than
+            numbers.
+    """
+    tape = Tape()
+    results = [_text(result) for result in function([Recorded(tape, name) for name in inputs])]
+    needed = set(results)
+    kept: dict[str, Operation] = {}
+    for place in range(len(tape.operations) - 1, -1, -1):
+        if f"%{place}" in needed:
+            kept[f"%{place}"] = tape.operations[place]
+            needed.update(tape.operations[place].operands)
+    return StraightLine(tuple(inputs), dict(reversed(kept.items())), tuple(results))
+
+
+def recorded_hold(
+    system: System,
+    duration: float,
+    substeps: int = SUBSTEPS,
+    functions: Any = Recording,
+    measure: Measure | None = None,
+    given: int = 0,
+) -> StraightLine:
+    """Record `rk4_hold` of a system: inputs x0..., u0..., d0..., outputs the state at the end.
+
+    Args:
+        system: The system.
+        duration: Length of the step [s].
+        substeps: Runge-Kutta steps in it.
+        functions: Elementary functions of recorded numbers.
+        measure: Computes further outputs from the state at the end.
+        given: Number of further inputs g0..., which only the measure sees.
+
+    Returns:
+        The operations of the step.
+    """
+    n, m = system.state_dim, system.control_dim
+    sizes = {"x": n, "u": m, "d": n, "g": given}
+    names = [f"{kind}{k}" for kind, count in sizes.items() for k in range(count)]
+
+    def hold(numbers: Sequence[Recorded]) -> Sequence[Any]:
+        state, control, push = numbers[:n], numbers[n : n + m], numbers[n + m : n + m + n]
+        end = rk4_hold(system, state, control, push, duration, functions, substeps)
+        if measure is None:
+            return end
+        return [*end, *measure(end, control, numbers[n + m + n :], functions)]
+
+    return straight_line(hold, names)
+
+
+def scalar_source(step: StraightLine, repeats: int) -> str:
+    """Return a module in Python that feeds the outputs to the first inputs, repeatedly.
+
+    Args:
+        step: What is repeated; it has no more outputs than inputs.
+        repeats: How often.
+
+    Returns:
+        Source of a function `held` of the inputs, as floats, that returns the outputs as a tuple.
+    """
+    lines, outputs = statements(step)
+    fed = ", ".join(step.inputs[: len(outputs)])
+    return "\n".join(
+        [
+            IMPORTS,
+            "",
+            f"def held({', '.join(step.inputs)}):",
+            f"    for _ in range({repeats}):",
+            *(f"        {line}" for line in lines),
+            f"        {fed} = {', '.join(outputs)}",
+            f"    return {fed}",
+            "",
+        ]
+    )
+
+
+def statements(step: StraightLine) -> tuple[list[str], list[str]]:
+    """Return the operations as assignments, and the outputs as expressions.
+
+    What is used once is written where it is used: it never becomes a variable.
+    """
+    counts: dict[str, int] = {}
+    for operation in step.operations.values():
+        for operand in operation.operands:
+            counts[operand] = counts.get(operand, 0) + 1
+    lines: list[str] = []
+    texts: dict[str, str] = {}
+    for place, (name, operation) in enumerate(step.operations.items()):
+        operands = [texts.get(operand, operand) for operand in operation.operands]
+        text = (
+            f"({operands[0]} {operation.symbol} {operands[1]})"
+            if len(operands) == 2
+            else f"{operation.symbol}({operands[0]})"
+        )
+        if counts.get(name, 0) > 1:
+            lines.append(f"v{place} = {text}")
+            text = f"v{place}"
+        texts[name] = text
+    return lines, [texts.get(output, output) for output in step.outputs]
+
+
+class ArrayFunction:
+    """A straight line on arrays of one shape, in buffers that are allocated once.
+
+    Args:
+        step: The operations.
+        shape: Shape of every input and output.
+
+    Attributes:
+        inputs: To be filled in before a call, shape (inputs, *shape).
+        outputs: What the last call gave, shape (outputs, *shape).
+    """
+
+    def __init__(self, step: StraightLine, shape: tuple[int, ...]) -> None:
+        """Give every result a buffer; one that nobody needs any more is used again."""
+        self.inputs = np.zeros((len(step.inputs), *shape))
+        self.outputs = np.empty((len(step.outputs), *shape))
+        self._calls: list[tuple[Any, tuple[FloatArray, ...]]] = []
+        arrays: dict[str, FloatArray] = dict(zip(step.inputs, self.inputs, strict=True))
+        last = step.last_uses
+        free: list[FloatArray] = []
+        for place, (name, operation) in enumerate(step.operations.items()):
+            operands = [_array(operand, arrays) for operand in operation.operands]
+            # An operation may write over its operands: all of them work entry by entry.
+            done = {name for name in operation.operands if last[name] == place}
+            free += [arrays[name] for name in sorted(done & step.operations.keys())]
+            arrays[name] = free.pop() if free else np.empty(shape)
+            self._calls.append((_UFUNCS[operation.symbol], (*operands, arrays[name])))
+        for output, row in zip(step.outputs, self.outputs, strict=True):
+            self._calls.append((np.copyto, (row, _array(output, arrays))))
+
+    def __call__(self) -> FloatArray:
+        """Evaluate at `inputs` and return `outputs`."""
+        for function, arguments in self._calls:
+            function(*arguments)
+        return self.outputs
+
+
+def _text(operand: Any) -> str:
+    if isinstance(operand, Recorded):
+        return operand.name
+    if isinstance(operand, float | int) and math.isfinite(operand):
+        return repr(float(operand))
+    raise TypeError(f"{operand!r} is no finite number; an equation of motion works on numbers")
+
+
+def _array(name: str, arrays: dict[str, FloatArray]) -> FloatArray:
+    # A constant as an array of no dimension: a Python float would be converted in every call.
+    return arrays[name] if name in arrays else np.array(float(name))

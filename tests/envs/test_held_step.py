@@ -1,0 +1,248 @@
+"""Recorded, in buffers or compiled: a held step is `rk4_hold` of the same physics."""
+
+import importlib.util
+import math
+import pickle
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import lagros_envs  # noqa: F401 - registers the ids
+from lagros_envs import cartpole_task as task
+from lagros_envs.dynamics import CartPole, Spacecraft, compiled, hold_step
+from lagros_envs.dynamics.held import HeldBatch, HeldStep
+from lagros_envs.dynamics.integrate import rk4_hold
+from lagros_envs.dynamics.straight_line import ArrayFunction, straight_line
+
+ODD = CartPole(cart_mass=2.3, pole_mass=0.4, half_length=0.7, cart_friction=0.0)
+SYSTEMS = [
+    pytest.param(CartPole(), id="cart-pole"),
+    pytest.param(ODD, id="another cart"),
+    pytest.param(Spacecraft(mass=1.7, inertia=0.6).by_wrench, id="spacecraft"),
+]
+needs_numba = pytest.mark.skipif(
+    importlib.util.find_spec("numba") is None, reason="numba is not installed"
+)
+BACKENDS = [False, pytest.param(True, marks=needs_numba)]
+
+
+def numbers(system, count, seed=0):
+    rng = np.random.default_rng(seed)
+    state = rng.uniform(-2.0, 2.0, (count, system.state_dim))
+    control = rng.uniform(-30.0, 30.0, (count, system.control_dim))
+    push = rng.uniform(-1.0, 1.0, (count, system.state_dim))
+    return state, control, push
+
+
+@pytest.mark.parametrize("compiled", BACKENDS)
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_a_step_on_floats_is_the_integrator_bit_for_bit(system, compiled):
+    run = HeldStep(system, 0.1, compiled).run
+    for state, control, push in zip(*numbers(system, 40), strict=True):
+        expected = rk4_hold(system, state.tolist(), control.tolist(), push.tolist(), 0.1, math)
+        assert run(*state.tolist(), *control.tolist(), *push.tolist()) == tuple(expected)
+
+
+@pytest.mark.parametrize("substeps", [1, 3, 4])
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_a_batch_is_the_integrator_bit_for_bit(system, substeps):
+    state, control, push = numbers(system, 21)
+    hold = HeldBatch(system, 0.1, (7, 3), substeps=substeps)
+    shaped = [part.T.reshape(-1, 7, 3) for part in (state, control, push)]
+    expected = hold_step(system, state, control, 0.1, push, substeps)
+    # Twice: buffers that are used again must not remember the first time.
+    for _ in range(2):
+        np.testing.assert_array_equal(hold(*shaped).reshape(-1, 21).T, expected)
+    again = hold_step(system, expected, control, 0.1, push, substeps)
+    np.testing.assert_array_equal(hold.go_on(hold(*shaped)).reshape(-1, 21).T, again)
+
+
+@needs_numba
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_a_compiled_batch_differs_in_the_last_digits_only(system):
+    state, control, push = numbers(system, 50)
+    hold = HeldBatch(system, 0.1, (50,), compiled=True)
+    expected = hold_step(system, state, control, 0.1, push)
+    np.testing.assert_allclose(hold(state.T, control.T, push.T).T, expected, rtol=1e-12, atol=1e-12)
+    again = hold_step(system, expected, control, 0.1, push)
+    found = hold.go_on(hold(state.T, control.T, push.T))
+    np.testing.assert_allclose(found.T, again, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("reach", [1.6, 30.0, 1e5])
+def test_the_vectorisable_sine_and_cosine_are_exact_to_rounding(reach):
+    angles = np.concatenate([np.linspace(-reach, reach, 20001), [0.0, math.pi, -math.pi / 2]])
+    for ours, exact in (
+        (compiled.VectorFunctions.sin, np.sin),
+        (compiled.VectorFunctions.cos, np.cos),
+    ):
+        np.testing.assert_allclose(ours(angles), exact(angles), rtol=0.0, atol=6e-16)
+
+
+@pytest.mark.parametrize("compiled", BACKENDS)
+def test_what_is_measured_belongs_to_the_state_at_the_end(compiled):
+    settings = task.CartPoleSettings(system=ODD, effort_weight=0.3, distance_weight=2.0)
+    state, force, push = numbers(ODD, 30)
+    goal = np.random.default_rng(1).uniform(-5.0, 5.0, (30, 4))
+    measure = task.StepMeasure(settings)
+    hold = HeldBatch(ODD, 0.1, (30,), compiled, measure=measure, given=4)
+    end = hold(state.T, force.T, push.T, goal.T).T
+    distance = np.linalg.norm(end - goal, axis=1)
+    effort = 0.1 * force[:, 0] ** 2
+    reward = task.reward(settings, effort, distance, False, False)
+    np.testing.assert_allclose(hold.measured, [distance, effort, reward], rtol=1e-12, atol=1e-11)
+
+
+@pytest.mark.parametrize("compiled", BACKENDS)
+def test_steps_survive_a_pickle(compiled):
+    state, control, push = numbers(ODD, 5)
+    hold = HeldBatch(ODD, 0.1, (5,), compiled)
+    expected = hold(state.T, control.T, push.T).copy()
+    copied = pickle.loads(pickle.dumps(hold))
+    np.testing.assert_array_equal(copied(state.T, control.T, push.T), expected)
+    step = HeldStep(ODD, 0.1, compiled)
+    arguments = [*state[0].tolist(), *control[0].tolist(), *push[0].tolist()]
+    assert pickle.loads(pickle.dumps(step)).run(*arguments) == step.run(*arguments)
+
+
+def test_a_recording_keeps_the_order_and_drops_what_is_not_needed():
+    def function(values):
+        x, y = values
+        share = x / y
+        return [(x + y) * (x + y), 2.0 - y, x + 0.0, x + -0.0, share - share + x, y]
+
+    recorded = straight_line(function, ["x", "y"])
+    run = ArrayFunction(recorded, (3,))
+    x, y = np.array([0.1, -0.0, 1e100]), np.array([0.7, -2.0, 3.0])
+    run.inputs[:] = x, y
+    for found, expected in zip(run(), function([x, y]), strict=True):
+        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(np.signbit(found), np.signbit(expected))
+    # Equal operations once, those with zeros of either sign apart.
+    symbols = [operation.symbol for operation in recorded.operations.values()]
+    assert sorted(symbols) == sorted("/+*-++-+")
+    lean = straight_line(lambda values: [values[0] * 2.0, values[1]][:1], ["x", "y"])
+    assert len(lean.operations) == 1
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda values: [values[0] if values[0] else 0.0], "must not branch"),
+        (lambda values: [values[0] * math.inf], "no finite number"),
+        (lambda values: [values[0] * "2"], "no finite number"),
+    ],
+)
+def test_what_cannot_be_recorded_is_refused(function, message):
+    with pytest.raises(TypeError, match=message):
+        straight_line(function, ["x"])
+
+
+def test_a_missing_numba_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "numba", None)
+    compiled.compiled_function.cache_clear()
+    with pytest.raises(ImportError, match=r"lagros\[fast\]"):
+        HeldBatch(CartPole(), 0.1, (2,), compiled=True)
+
+
+@needs_numba
+def test_a_folder_that_cannot_be_written_only_costs_the_cache(monkeypatch, tmp_path):
+    (tmp_path / "lagros").write_text("a file where the folder should be")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    source = "def held(x):\n    return x + 1.0\n"
+    assert compiled.compiled_function(source)(2.0) == 3.0
+
+
+@needs_numba
+@pytest.mark.slow
+def test_compiled_code_is_kept_and_found_again(run_python, tmp_path):
+    script = """
+from lagros_envs.dynamics import CartPole
+from lagros_envs.dynamics.held import HeldStep
+run = HeldStep(CartPole(), 0.1, compiled=True).run
+print(run(*[0.1] * 9), sum(run.stats.cache_hits.values()))
+"""
+    seen = [run_python(script, XDG_CACHE_HOME=str(tmp_path)).split(") ") for _ in range(2)]
+    assert [int(hits) for _, hits in seen] == [0, 1]
+    assert seen[0][0] == seen[1][0]
+    assert list(tmp_path.glob("lagros/*.py"))
+
+
+@needs_numba
+@pytest.mark.parametrize("kind", ["none", "gust"])
+def test_a_compiled_environment_flies_the_same_episode(kind, hold):
+    envs = [gym.make("lagros/CartPole-v0", disturbance=kind, compiled=flag) for flag in (0, 1)]
+    for seed in (1, 2):
+        observations = [env.reset(seed=seed)[0] for env in envs]
+        for step in range(90):
+            state = envs[0].unwrapped.state
+            action = hold(state, observations[0][4:8]) if step != 40 else np.array([1e200])
+            (first, *others), (second, *same) = (env.step(action) for env in envs)
+            np.testing.assert_array_equal(first, second)
+            assert others[:3] == same[:3]
+            assert all(np.array_equal(others[3][key], same[3][key]) for key in others[3])
+
+
+@needs_numba
+@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+def test_compiled_worlds_fly_the_same_episodes(mode, hold):
+    first, second = (
+        gym.make_vec(
+            "lagros/CartPole-v0",
+            num_envs=5,
+            disturbance="uniform",
+            compiled=flag,
+            autoreset_mode=mode,
+        )
+        for flag in (False, True)
+    )
+    first.reset(seed=3)
+    second.reset(seed=3)
+    for _ in range(100):
+        ours, theirs = (
+            envs.step(hold(envs.unwrapped.state, envs.unwrapped._goal.T))
+            for envs in (first, second)
+        )
+        for one, other in zip(ours[:4], theirs[:4], strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(
+            first.unwrapped.state, second.unwrapped.state, rtol=1e-9, atol=1e-9
+        )
+
+
+@needs_numba
+def test_compiled_spacecraft_fly_the_same_episodes():
+    first, second = (
+        gym.make_vec(
+            "lagros/Spacecraft-v0",
+            num_envs=6,
+            num_agents=3,
+            preset="open",
+            disturbance="uniform",
+            compiled=flag,
+        )
+        for flag in (False, True)
+    )
+    first.reset(seed=3)
+    second.reset(seed=3)
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        actions = rng.uniform(0.0, 0.5, (6, 8)).astype(np.float32)
+        first.step(actions)
+        second.step(actions)
+        np.testing.assert_allclose(first.unwrapped.states, second.unwrapped.states, atol=1e-11)
+
+
+def test_any_system_that_states_its_derivative_can_be_recorded():
+    """A pendulum that nobody has written before."""
+    pendulum = SimpleNamespace(
+        state_dim=2,
+        control_dim=1,
+        derivative=lambda x, u, functions: (x[1], u[0] - 9.8 * functions.sin(x[0])),
+    )
+    hold = HeldBatch(pendulum, 0.2, (3,))
+    state, control = np.array([[0.1, 1.0, -2.0], [0.0, 0.3, 1.0]]), np.array([[0.5, 0.0, -1.0]])
+    expected = hold_step(pendulum, state.T, control.T, 0.2, np.zeros((3, 2)))
+    np.testing.assert_array_equal(hold(state, control, np.zeros((2, 3))).T, expected)
