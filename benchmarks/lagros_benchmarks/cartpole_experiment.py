@@ -107,7 +107,7 @@ class CartPoleExperiment:
     @property
     def timed_apart(self) -> bool:
         """Whether workers contend for the processor."""
-        return self.settings.jobs > 1
+        return self.settings.backend.in_parallel(self.settings.jobs)
 
     def units(self, progress: Progress | None) -> list[NominalPlan]:
         """Return the nominal plan of every episode."""
@@ -193,7 +193,7 @@ def plan_nominals(
     def work(seeds: Sequence[int]) -> list[NominalPlan]:
         return _plan_chunk(settings, toolbox, seeds)
 
-    planned = gather("planning", work, chunks, settings.jobs, progress)
+    planned = gather("planning", work, chunks, settings.jobs, progress, settings.backend)
     return [plan for part in planned for plan in part]
 
 

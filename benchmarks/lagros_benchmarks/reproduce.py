@@ -21,6 +21,7 @@ from lagros_benchmarks.runner import Progress
 from lagros_benchmarks.settings import BenchmarkSettings
 from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.files import write_atomic
+from lagros_policies.backends import LOKY, Backend
 from lagros_policies.contraction import Metric, load_metric, save_metric
 from lagros_policies.imitation.dataset import ExpertData, ExpertDataSettings, generate
 from lagros_policies.imitation.features import FEATURES, cartpole_features
@@ -45,6 +46,7 @@ class ReproduceSettings:
         bound: d_bar of the table, uniform in the ball.
         seed: Seed of the table.
         jobs: Processes; they change no result.
+        backend: Whose processes they are; those of a cluster must see the run's folder.
     """
 
     metric: MetricDesignSettings = field(default_factory=MetricDesignSettings)
@@ -55,6 +57,7 @@ class ReproduceSettings:
     bound: float = 0.75
     seed: int = 0
     jobs: int = 2
+    backend: Backend = LOKY
 
     @property
     def shipped_benchmark(self) -> BenchmarkSettings:
@@ -65,6 +68,7 @@ class ReproduceSettings:
             bounds=(self.bound,),
             seed=self.seed,
             jobs=self.jobs,
+            backend=self.backend,
         )
 
 
@@ -92,6 +96,7 @@ def reproduce_cartpole(
         ValueError: The folder holds a run of other settings.
     """
     settings = settings or ReproduceSettings()
+    folder = folder.absolute()
     update = progress or (lambda title, done, total: None)
     note = say or (lambda line: None)
     task = CartPoleSettings()
@@ -105,6 +110,7 @@ def reproduce_cartpole(
         task,
         settings.jobs,
         lambda done: update("expert data", done, settings.data.shards),
+        settings.backend,
     )
     note(
         f"expert data ({perf_counter() - begun:.0f} s): {len(data.observation)} samples around "
@@ -209,7 +215,7 @@ def _plan_of_pairs(data: ExpertData) -> NDArray[np.intp]:
 def _claim(folder: Path, settings: ReproduceSettings) -> None:
     """Refuse to go on with files of other settings; the jobs do not matter."""
     record = asdict(settings)
-    for free in ("jobs", "episodes", "seed", "bound"):
+    for free in ("jobs", "backend", "episodes", "seed", "bound"):
         del record[free]
     folder.mkdir(parents=True, exist_ok=True)
     claim(folder / "settings.json", record, "a run")

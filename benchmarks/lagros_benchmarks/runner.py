@@ -16,6 +16,7 @@ from lagros_benchmarks.settings import BenchmarkSettings, Case
 from lagros_benchmarks.spacecraft_experiment import Scene, SpacecraftExperiment
 from lagros_benchmarks.spacecraft_experiment import fly_scene as fly_world
 from lagros_benchmarks.workers import Progress, gather, split
+from lagros_policies.backends import running
 
 __all__ = ["BenchmarkRun", "Case", "Progress", "fly_scene", "make_experiment", "run_benchmark"]
 
@@ -50,11 +51,13 @@ def run_benchmark(
     Raises:
         SetupError: A policy, the planner or the metric cannot be built. (What an episode raises is
             recorded as its failure instead.)
+        BackendError: The backend is not installed, not reachable, or loses its workers.
     """
     experiment = make_experiment(settings, toolbox)
-    units = experiment.units(progress)
     cases = settings.cases
-    outcomes = _play_cases(experiment, settings, cases, units, progress)
+    with running(settings.backend, settings.jobs):
+        units = experiment.units(progress)
+        outcomes = _play_cases(experiment, settings, cases, units, progress)
     timing = None
     if experiment.timed_apart:
         timing = _time_cases(experiment, settings, cases, units, progress)
@@ -88,7 +91,7 @@ def _play_cases(
         return experiment.play(*chunk)
 
     outcomes: dict[Case, list[Any]] = {case: [] for case in cases}
-    played = gather("episodes", work, chunks, settings.jobs, progress)
+    played = gather("episodes", work, chunks, settings.jobs, progress, settings.backend)
     for (case, _), outcome in zip(chunks, played, strict=True):
         outcomes[case].append(outcome)
     return outcomes

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from lagros_envs.disturbances import KINDS
 from lagros_envs.seeding import EVALUATION, episode_seeds
+from lagros_policies.backends import LOKY, Backend
 
 TASKS = ("cartpole", "spacecraft")
 CHANNELS = ("all", "rates")
@@ -140,6 +141,7 @@ class BenchmarkSettings:
         timing_episodes: The published step times come from a serial pass over this many first
             episodes: with more than one job the workers contend for the processor, and the
             spacecraft fly in batches.
+        backend: Whose processes the workers are.
 
     Raises:
         ValueError: A setting is not valid.
@@ -160,6 +162,7 @@ class BenchmarkSettings:
     jobs: int = 1
     chunk: int = 25
     timing_episodes: int = 10
+    backend: Backend = LOKY
 
     def __post_init__(self) -> None:
         """Check the settings."""

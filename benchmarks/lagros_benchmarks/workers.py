@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import TypeVar
 
+from lagros_policies.backends import LOKY, Backend, each
+
 # (what is being done, units done, units in all).
 Progress = Callable[[str, int, int], None]
 Item = TypeVar("Item")
@@ -17,6 +19,7 @@ def gather(
     items: Sequence[Item],
     jobs: int,
     progress: Progress | None,
+    backend: Backend = LOKY,
 ) -> list[Outcome]:
     """Return the results of the work, in the order of the items, whatever the jobs.
 
@@ -26,21 +29,17 @@ def gather(
         items: The items.
         jobs: Worker processes; 1 works in this one.
         progress: Called after every item.
-    """
-    outcomes: Iterator[Outcome] = map(work, items)
-    if jobs > 1:
-        from joblib import Parallel, delayed
+        backend: Whose processes they are.
 
-        # joblib allows each worker cpu_count // jobs threads of BLAS and OpenMP.
-        outcomes = Parallel(n_jobs=jobs, backend="loky", return_as="generator")(
-            delayed(work)(item) for item in items
-        )
-    joined: list[Outcome] = []
-    for done, outcome in enumerate(outcomes, start=1):
-        joined.append(outcome)
+    Raises:
+        BackendError: The backend is not installed, not reachable, or loses its workers.
+    """
+    joined: dict[int, Outcome] = {}
+    for index, outcome in each(work, items, jobs, backend):
+        joined[index] = outcome
         if progress is not None:
-            progress(title, done, len(items))
-    return joined
+            progress(title, len(joined), len(items))
+    return [joined[index] for index in range(len(items))]
 
 
 def split(items: Sequence[Item], size: int) -> Iterator[Sequence[Item]]:

@@ -3,10 +3,10 @@
 Flies every network of a folder of `lagros reproduce spacecraft` in the preset `paper` under uniform
 disturbance, with and without the safety filter, on worlds of a namespace of their own: neither
 those of training nor those of the published tables. With `--width` a network of that width is
-fitted to the flights of the folder first.
+fitted to the flights of the folder first, with `--seeds` networks of other seeds.
 
     python benchmarks/studies/spacecraft_networks.py [--folder runs/reproduce-spacecraft]
-        [--worlds 60] [--bound 0.2,0.6,1.0] [--width 200] [--json FILE]
+        [--worlds 60] [--bound 0.2,0.6,1.0] [--width 200] [--seeds 3] [--json FILE]
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from lagros_benchmarks.metrics import wilson_interval
-from lagros_benchmarks.reproduce_spacecraft import SpacecraftReproduceSettings
+from lagros_benchmarks.reproduce_spacecraft import SpacecraftReproduceSettings, training_part
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.spacecraft_task import SpacecraftSettings
@@ -63,25 +63,21 @@ def fly(weights: Path, bound: float, worlds: int, filtered: bool) -> dict[str, A
     }
 
 
-def fit_wider(folder: Path, width: int) -> Path:
-    """Fit a network of another width to the flights of the folder; return its file."""
+def fit_other(folder: Path, seed: int, width: int) -> Path:
+    """Fit a network of another seed or width to the flights of the folder; return its file."""
     settings, task = SpacecraftReproduceSettings(), SpacecraftSettings()
-    weights = folder / f"wide{width}.safetensors"
+    weights = folder / f"seed{seed}_width{width}.safetensors"
     if weights.exists():
         return weights
     parts = [fly_expert(folder / "flights", settings.flights, task)]
     for index, flights in enumerate(settings.rounds, start=1):
         learner = folder / f"spacecraft_round{index - 1}.safetensors"
         met = fly_expert(folder / f"relabelled{index}", flights, task, learner)
-        parts += [met] * settings.relabelled_weight
+        parts += [training_part(met, settings)] * settings.relabelled_weight
     samples = join([flight_samples(part, task, 0.25, 0.25) for part in parts])
     layers = (width, width)
-    training = replace(settings.lagros, element=layers, agent=layers, epochs=5, batch=2048)
-    network: DeepSet = fit_deep_set(
-        samples,
-        training,
-        folder / f"wide{width}_checkpoint.safetensors",
-    )
+    training = replace(settings.lagros, element=layers, agent=layers, seed=seed)
+    network: DeepSet = fit_deep_set(samples, training, weights.with_suffix(".checkpoint"))
     network.save(weights)
     return weights
 
@@ -112,12 +108,15 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=60)
     parser.add_argument("--bound", default="0.2,0.6,1.0", help="disturbance bounds, by commas")
     parser.add_argument("--width", type=int, help="fit a network of this width too")
+    parser.add_argument("--seeds", type=int, default=0, help="fit so many other seeds too")
     parser.add_argument("--json", type=Path, help="write the rows there")
     options = parser.parse_args()
     networks = sorted(options.folder.glob("spacecraft_round*.safetensors"))
     networks.append(options.folder / "spacecraft_lagros.safetensors")
+    seed, width = SpacecraftReproduceSettings().lagros.seed, 100
+    networks += [fit_other(options.folder, seed + 1 + one, width) for one in range(options.seeds)]
     if options.width is not None:
-        networks.append(fit_wider(options.folder, options.width))
+        networks.append(fit_other(options.folder, seed, options.width))
     rows = [
         fly(weights, float(bound), options.worlds, filtered)
         for weights in networks

@@ -10,6 +10,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.files import write_atomic
+from lagros_policies.backends import LOKY, Backend, each
 
 Shard = dict[str, NDArray[Any]]
 
@@ -28,6 +30,7 @@ def make_shards(
     record: Mapping[str, Any],
     jobs: int = 1,
     on_shard: Callable[[int], None] | None = None,
+    backend: Backend = LOKY,
 ) -> list[Shard]:
     """Make all shards, or those that an interrupted call left out.
 
@@ -38,15 +41,15 @@ def make_shards(
         record: What the data depend on; kept beside them.
         jobs: Processes.
         on_shard: Called with the number of shards that are finished.
+        backend: Whose processes they are; they need not see the folder.
 
     Returns:
         The shards in the order of their indices.
 
     Raises:
         ValueError: The folder holds data of another record, or a shard is damaged.
+        BackendError: The backend is not installed, not reachable, or loses its workers.
     """
-    import joblib
-
     folder.mkdir(parents=True, exist_ok=True)
     claim(folder / "manifest.json", record, "expert data")
     paths = [folder / f"shard_{index:04d}.npz" for index in range(count)]
@@ -54,8 +57,8 @@ def make_shards(
     done = count - len(missing)
     if on_shard is not None:
         on_shard(done)
-    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
-    for _ in parallel(joblib.delayed(_write)(paths[index], make, index) for index in missing):
+    for one, packed in each(partial(_packed, make), missing, jobs, backend):
+        write_atomic(paths[missing[one]], packed)
         done += 1
         if on_shard is not None:
             on_shard(done)
@@ -95,8 +98,8 @@ def claim(path: Path, record: Mapping[str, Any], what: str) -> None:
         )
 
 
-def _write(path: Path, make: Callable[[int], Shard], index: int) -> None:
+def _packed(make: Callable[[int], Shard], index: int) -> bytes:
     buffer = io.BytesIO()
     # Arrays that pickle would have to write are refused, not pickled.
     np.savez(buffer, allow_pickle=False, **make(index))
-    write_atomic(path, buffer.getvalue())
+    return buffer.getvalue()

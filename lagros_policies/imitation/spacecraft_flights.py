@@ -22,6 +22,7 @@ from lagros_envs.scenarios import Preset, preset_named
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.spacecraft_episode import SpacecraftEpisode
 from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_policies.backends import LOKY, Backend
 from lagros_policies.imitation.shards import Shard, make_shards
 from lagros_policies.imitation.spacecraft_policy import SpacecraftNetworkPolicy
 from lagros_policies.spacecraft_expert import SpacecraftExpert, SpacecraftExpertSettings
@@ -122,6 +123,7 @@ def fly_expert(
     learner: Path | None = None,
     jobs: int = 1,
     on_shard: Callable[[int], None] | None = None,
+    backend: Backend = LOKY,
 ) -> FlightData:
     """Fly and label, or finish what an interrupted call began.
 
@@ -132,6 +134,7 @@ def fly_expert(
         learner: Weights of the network that flies; None lets the expert fly.
         jobs: Processes; they change no result.
         on_shard: Called with the number of shards that are finished.
+        backend: Whose processes they are; those of a cluster must see the weights at this path.
 
     Returns:
         All samples, in an order that does not depend on the processes.
@@ -140,13 +143,15 @@ def fly_expert(
         ValueError: The folder holds flights of other settings, or a shard is damaged.
     """
     task = task or SpacecraftSettings()
-    make = partial(make_shard, settings=settings, task=task, learner=learner)
+    # Processes elsewhere have a working folder of their own.
+    weights = None if learner is None else learner.absolute()
+    make = partial(make_shard, settings=settings, task=task, learner=weights)
     record = {
         "flights": asdict(settings),
         "task": asdict(task),
         "learner": None if learner is None else _digest(learner),
     }
-    shards = make_shards(folder, settings.shards, make, record, jobs, on_shard)
+    shards = make_shards(folder, settings.shards, make, record, jobs, on_shard, backend)
     observation, acceleration, world = (
         np.concatenate([shard[name] for shard in shards])
         for name in ("observation", "acceleration", "world")

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import filecmp
 
+import numpy as np
 import pytest
 
 from lagros_benchmarks.reproduce import ReproduceSettings, reproduce_cartpole
 from lagros_benchmarks.reproduce_spacecraft import (
     SpacecraftReproduceSettings,
     reproduce_spacecraft,
+    training_part,
 )
 from lagros_benchmarks.runner import run_benchmark
+from lagros_envs.observation import Layout
 from lagros_policies.imitation.dataset import ExpertDataSettings
-from lagros_policies.imitation.spacecraft_flights import FlightSettings
+from lagros_policies.imitation.spacecraft_flights import FlightData, FlightSettings
 from lagros_policies.imitation.train import TrainingSettings
 from lagros_policies.imitation.train_deep_set import DeepSetTraining
 from lagros_policies.metric_design import MetricDesignSettings
@@ -116,3 +119,23 @@ def test_the_spacecraft_run_is_resumed_and_ends_with_the_same_files(tmp_path):
     assert (sorted(same), different, missing) == (sorted(SPACECRAFT_FILES), [], [])
     assert {"learned", "tube-mpc", "lagros", "centralized"} == set(benchmark.policies)
     assert str(tmp_path) in benchmark.policy_settings["lagros"]["weights"]
+
+
+def test_what_is_learned_from_a_network_has_sane_labels_and_nobody_at_rest():
+    settings = SpacecraftReproduceSettings(label_limit=2.0, least_speed=0.1, held_out=0.5)
+    layout = Layout(1, 1, 45.0)
+    observation = np.zeros((5, layout.size), np.float32)
+    observation[:, layout.slices["goal"]] = (3.0, 0.0)
+    observation[:, layout.slices["velocity"]] = (0.0, 0.2)
+    observation[:, layout.slices["time"]] = 10.0
+    observation[1, layout.slices["velocity"]] = 0.01  # at rest under way
+    observation[2, layout.slices["velocity"]] = 0.01  # at rest at the goal
+    observation[2, layout.slices["goal"]] = 0.1
+    label = np.array([[6.0, -8.0, 1.0], [1, 1, 1], [0.1, 0.2, 9.0], [1, 1, 1], [0, 0, 0]])
+    world = np.array([1, 1, 3, 2, 3])  # of every second world nothing is learned
+    data = FlightData(observation, label.astype(np.float32), world, layout, 1, 0)
+    kept = training_part(data, settings)
+    np.testing.assert_array_equal(kept.world, [1, 3, 3])
+    np.testing.assert_allclose(
+        kept.acceleration, [[1.2, -1.6, 1.0], [0.1, 0.2, 9.0], [0, 0, 0]], rtol=1e-6
+    )
