@@ -8,6 +8,7 @@ double, so widening each result by at least one unit in the last place encloses 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Union
 
 import numpy as np
@@ -215,12 +216,20 @@ def transpose(matrix: Interval) -> Interval:
     return _pair(np.swapaxes(matrix.lower, -1, -2), np.swapaxes(matrix.upper, -1, -2))
 
 
-def negative_definite(matrices: Interval) -> BoolArray:
+def negative_definite(matrices: Interval, added: Sequence[Interval] = ()) -> BoolArray:
     """Return which interval matrices (..., n, n) hold only negative definite symmetric ones.
 
     With Q from the eigenvectors of the midpoint, Q' F Q is near -I: Q' F Q = -I + E, |E| <= R. It
     is negative definite if the spectral radius of R is below one, for which R d < d with some
     d > 0 suffices; and then Q is regular and F is negative definite.
+
+    Args:
+        matrices: The matrices, shape (..., n, n).
+        added: Further symmetric matrices, which broadcast against these: any multiples of their
+            members by numbers from -1 to 1 may be added to the members of `matrices`.
+
+    Returns:
+        Whether that is shown, shape (...).
     """
     middle = matrices.midpoint
     middle = 0.5 * (middle + np.swapaxes(middle, -1, -2))
@@ -233,8 +242,15 @@ def negative_definite(matrices: Interval) -> BoolArray:
     # The radius is taken about this midpoint, whatever rounding made of it.
     reach = np.maximum(matrices.upper - middle, middle - matrices.lower)
     reach = np.maximum(reach, np.swapaxes(reach, -1, -2)) * (1.0 + _SLACK)
-    reach = np.abs(turned) @ (reach + _PRODUCT_ERROR * np.abs(middle)) @ np.abs(basis)
-    error = np.abs(turned @ middle @ basis + np.eye(middle.shape[-1])) + reach
+    reach = reach + _PRODUCT_ERROR * np.abs(middle)
+    error = np.abs(turned @ middle @ basis + np.eye(middle.shape[-1]))
+    for part in added:
+        centre, radius = part.midpoint, part.radius
+        error = error + np.abs(turned @ centre @ basis)
+        reach = reach + radius * (1.0 + _SLACK) + _PRODUCT_ERROR * np.abs(centre)
+    error = error + np.abs(turned) @ reach @ np.abs(basis)
+    # What is not symmetric by rounding alone may count on either side.
+    error = np.maximum(error, np.swapaxes(error, -1, -2))
     weight = np.ones(error.shape[:-1])
     for _ in range(4):
         weight = np.einsum("...ij,...j->...i", error, weight) + 1e-3 * weight

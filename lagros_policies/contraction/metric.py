@@ -24,8 +24,11 @@ _FORMAT = "lagros-metric-1"
 class Region:
     """The states and errors for which a cart-pole metric was designed and checked.
 
-    The metric does not depend on the position, nor does the pole's motion on the cart's speed, so
-    neither is bounded.
+    The check draws triples (x, x_d, u_d) around plans and keeps those that lie within these bounds.
+    On a plan the force goes with the angle, so that this covers a part of the bounds only: taken as
+    a box of independent numbers they hold states at which the shipped metric fails. `prove` says
+    what holds on a whole box. Neither the metric nor its condition depends on the position, and
+    that of x_d's speed is bounded by the plans alone.
 
     Attributes:
         angle: Largest |theta| of x and of x_d [rad].
@@ -183,9 +186,9 @@ def basis_rate(angle: FloatArray, angular_rate: FloatArray, degree: int) -> Floa
     return rates
 
 
-def save_metric(metric: Metric, path: Path | str) -> None:
-    """Write a metric as JSON, atomically; numbers keep every bit."""
-    record: dict[str, Any] = {
+def metric_record(metric: Metric) -> dict[str, Any]:
+    """Return a metric as the JSON object that `load_metric` reads; numbers keep every bit."""
+    return {
         "format": _FORMAT,
         "basis": "cos(theta)^i",
         "coefficients": metric.coefficients.tolist(),
@@ -200,7 +203,11 @@ def save_metric(metric: Metric, path: Path | str) -> None:
             name: getattr(metric.verification, name) for name in Verification.__dataclass_fields__
         },
     }
-    write_atomic(path, json.dumps(record, indent=1) + "\n")
+
+
+def save_metric(metric: Metric, path: Path | str) -> None:
+    """Write a metric as JSON, atomically; numbers keep every bit."""
+    write_atomic(path, json.dumps(metric_record(metric), indent=1) + "\n")
 
 
 def load_metric(path: Path | str | None = None) -> Metric:

@@ -1,0 +1,40 @@
+"""One line of a certificate: what is claimed, how it is known, and whether it holds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+Kind = Literal["proved", "calibrated", "observed"]
+
+
+@dataclass(frozen=True, slots=True)
+class Statement:
+    """A claim with the kind of evidence behind it.
+
+    Attributes:
+        text: The claim in plain words, with its numbers and their units.
+        kind: "proved" (sound over a continuous set), "calibrated" (with a stated confidence from
+            finitely many episodes) or "observed" (counted).
+        holds: Whether the claim was established. A proof that was not found is a statement that
+            does not hold, whether or not its opposite was shown.
+        seconds: Time that the evidence took [s].
+
+    Raises:
+        ValueError: The text is empty, the kind unknown or the time negative or not finite.
+    """
+
+    text: str
+    kind: Kind
+    holds: bool
+    seconds: float
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not self.text.strip():
+            raise ValueError("text='' must say what is claimed")
+        if self.kind not in get_args(Kind):
+            raise ValueError(f"kind={self.kind!r} must be one of {', '.join(get_args(Kind))}")
+        if not (math.isfinite(self.seconds) and self.seconds >= 0.0):
+            raise ValueError(f"seconds={self.seconds!r} must be finite and >= 0")
