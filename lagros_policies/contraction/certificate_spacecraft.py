@@ -1,0 +1,206 @@
+"""The spacecraft's certificate: for all states, by exact arithmetic and a Schur complement."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.dynamics import Spacecraft
+from lagros_policies.contraction.certificate import Certificate, Stopwatch, TubeSizes
+from lagros_policies.contraction.double_integrator import (
+    AxisMetric,
+    certified_margin,
+    position_tube,
+    state_tube,
+)
+from lagros_policies.contraction.ellipsoid_axis import (
+    design_axis_ellipsoid,
+    prove_axis_ellipsoid,
+)
+from lagros_policies.contraction.prove_spacecraft import (
+    control_square,
+    prove_axis,
+    prove_spacecraft,
+)
+from lagros_policies.contraction.statement import Statement
+from lagros_policies.contraction.tube import diverging_bound
+
+FloatArray = NDArray[np.float64]
+
+_AXES = 3
+# Far above the rounding of an eigenvalue, and what the proof of an axis gives up of the rate.
+_ROUNDING = 1e-9
+
+
+def spacecraft_certificate(
+    plane: AxisMetric,
+    turning: AxisMetric,
+    body: Spacecraft,
+    *,
+    disturbance_bound: float,
+    learning_error: float,
+    paper_radius: float,
+    thrust: float = 1.0,
+    policy: str = "lagros",
+) -> Certificate:
+    """Return the certificate of a metric of the plane, taken for all three axes.
+
+    Args:
+        plane: Metric of x and y, with the period of the hold; it serves the heading here too.
+        turning: Metric that the tracking law has for the heading.
+        body: The spacecraft.
+        disturbance_bound: d_bar, in units of the state per second.
+        learning_error: eps_l, as an acceleration in the plane [m/s^2].
+        paper_radius: What the published tube tends to.
+        thrust: Largest force of a thruster in u_d [N], which bounds the terms of the heading in A.
+        policy: Whose learning error that is.
+
+    Raises:
+        ValueError: B B' depends on the heading, or the metric's coupling leaves no room for a
+            finite nu.
+    """
+    watch = Stopwatch()
+    square = control_square(body)
+    if square is None:
+        raise ValueError(f"B B' of {body} is not one diagonal at every heading")
+    gain = math.sqrt(float(max(square)))
+    # Thrusters push both ways along each body axis, two at a time.
+    push = 2.0 * math.sqrt(2.0) * thrust / body.mass
+    weight = control_weight(plane, float(min(square)), push)
+    dual = whole_dual(plane)
+    values = np.linalg.eigvalsh(dual)
+    # I <= W_bar: the least eigenvalue is brought to one, with room for its rounding.
+    least = float(values[0]) * (1.0 - _ROUNDING)
+    chi = prove_axis(plane).condition * (1.0 + 2.0 * _ROUNDING)
+    statements = prove_spacecraft(plane, turning, body)
+    watch.lap()
+    tube = state_tube(plane, disturbance_bound + learning_error)
+    position = position_tube(plane, disturbance_bound + learning_error)
+    pushed = max(1.0, push)
+    return Certificate(
+        task="spacecraft",
+        policy=policy,
+        region=_region(thrust),
+        alpha=plane.rate * (1.0 - _ROUNDING),
+        chi=chi,
+        nu=weight / least,
+        b_bar=gain,
+        epsilon_l=learning_error / gain,
+        d_bar=disturbance_bound,
+        channels="all",
+        basis="1 (W_bar is constant); the state is [x, y, heading, vx, vy, spin]",
+        coefficients=dual[None] / least,
+        tube=TubeSizes(paper_radius, tube.steady_radius * (1.0 + 2.0 * _ROUNDING)),
+        statements=(
+            *statements,
+            Statement(
+                f"equation (14) for the six states and a control at will, with the nu of this "
+                f"certificate, for every u_d of thrusters up to {thrust:g} N: Schur complement",
+                "proved",
+                weight > 0.0,
+                watch.lap(),
+            ),
+            *_tubes(plane, disturbance_bound, learning_error, tube.steady_radius),
+            _lemma(pushed, disturbance_bound, learning_error),
+        ),
+        details={
+            "tubes": {
+                "position": position.steady_radius,
+                "position_held_without_learning_error": certified_margin(plane, disturbance_bound),
+            },
+            "lipschitz": pushed,
+        },
+    )
+
+
+def control_weight(metric: AxisMetric, gain: float, push: float) -> float:
+    """Return a nu for which (14) holds for the six states at the metric's own rate.
+
+    With W_bar = [[1, q], [q, s]] per axis and C the derivative of the acceleration by the heading,
+    ||C|| <= push, the left side has the blocks P = 2 (q + alpha) I, Q = (s + 2 alpha q) I + C and
+    R = 2 alpha s I + q (C + C') - 2 nu g: negative by a Schur complement if
+
+        2 nu g > 2 alpha s + 2 |q| push + (|s + 2 alpha q| + push)^2 / (-2 (q + alpha)).
+
+    Args:
+        metric: The metric, with q < -alpha, which a hold brings about.
+        gain: The least entry g of B B'.
+        push: Bound of the acceleration of u_d, at every heading.
+
+    Raises:
+        ValueError: q is not below -alpha.
+    """
+    alpha, q, s = metric.rate, metric.coupling, metric.stiffness
+    room = -2.0 * (q + alpha)
+    if not room > 0.0:
+        raise ValueError(
+            f"coupling={q!r} must be below -{alpha!r} for a finite nu: use a metric with a period"
+        )
+    size = 2.0 * alpha * s + 2.0 * abs(q) * push + (abs(s + 2.0 * alpha * q) + push) ** 2 / room
+    return size / (2.0 * gain) * (1.0 + 1e-6)
+
+
+def whole_dual(metric: AxisMetric) -> FloatArray:
+    """Return W for the six states [x, y, heading, vx, vy, spin], one metric for all axes."""
+    return np.asarray(np.kron(metric.dual, np.eye(_AXES)), dtype=np.float64)
+
+
+def _region(thrust: float) -> dict[str, tuple[float, float]]:
+    # For all states: W_bar is constant and A depends on heading and thrust alone. The other
+    # intervals only give whoever samples something finite to sample.
+    wide = (-1e3, 1e3)
+    turn = (-math.pi, math.pi)
+    return {
+        **dict.fromkeys(("x", "y"), wide),
+        "heading": turn,
+        **dict.fromkeys(("vx", "vy", "spin"), wide),
+        "u_d": (0.0, thrust),
+    }
+
+
+def _tubes(
+    plane: AxisMetric, bound: float, learning_error: float, radius: float
+) -> list[Statement]:
+    watch = Stopwatch()
+    reach = position_tube(plane, bound + learning_error).steady_radius
+    first = Statement(
+        f"Theorem 1, control at will: ||e|| of the plane's four states tends to at most "
+        f"{radius:.4g}, its position error to {reach:.4g} m, for d_bar = {bound:g} and "
+        f"||u_L - u*|| <= {learning_error:.4g} m/s^2",
+        "proved",
+        prove_axis(plane).holds,
+        watch.lap(),
+    )
+    margin = certified_margin(plane, bound)
+    second = Statement(
+        f"u* held for {plane.period:g} s, without learning error: the position error never exceeds "
+        f"{margin:.4g} m under d_bar = {bound:g}, at and between the instants (of a wrench that "
+        "keeps its direction while the body turns)",
+        "proved",
+        prove_axis(plane).holds,
+        watch.lap(),
+    )
+    ellipsoid = design_axis_ellipsoid(plane.period, "state")
+    third = Statement(
+        f"invariant ellipsoid, v = K e held for {plane.period:g} s with K = "
+        f"{ellipsoid.gain.round(4).tolist()}, without learning error: the position error never "
+        f"exceeds {ellipsoid.position * bound:.4g} m under d_bar = {bound:g} (likewise)",
+        "proved",
+        prove_axis_ellipsoid(ellipsoid),
+        watch.lap(),
+    )
+    return [first, second, third]
+
+
+def _lemma(lipschitz: float, bound: float, learning_error: float) -> Statement:
+    watch = Stopwatch()
+    at = diverging_bound(np.array([1.0, 10.0]), lipschitz, bound + learning_error)
+    return Statement(
+        f"Lemma 1: L_f <= {lipschitz:.4g} 1/s for all states, so that without feedback ||e|| is "
+        f"bounded by {at[0]:.3g} after 1 s and by {at[1]:.3g} after 10 s only",
+        "proved",
+        True,
+        watch.lap(),
+    )

@@ -1,0 +1,172 @@
+"""Proof and control law of a tube with a constant metric, first of all of the invariant ellipsoid.
+
+The condition of the ellipsoid is Theorem 2's (14) and a constant more:
+
+    2 sym(A W) - 2 nu B B' + 2 alpha W + w_bar^2 / (2 alpha) I < 0.
+
+It is proved on a continuous box by the search that proves (14), with the constant added to every
+enclosure.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.dynamics import CartPole, System, control_matrix, vector_field
+from lagros_policies.contraction.intervals import Interval, exact, negative_definite
+from lagros_policies.contraction.metric import Metric, Region
+from lagros_policies.contraction.prove_cells import Examined, Search, search
+from lagros_policies.contraction.prove_rates import RateCondition, Violation, rate_condition
+from lagros_policies.contraction.tube_design import ConstantTube
+
+FloatArray = NDArray[np.float64]
+
+# ||phi_1||^2 below which the control has no effect on V.
+_TINY = 1e-300
+# Cells of one pass, and of a whole search.
+_BATCH = 100
+_MOST_CELLS = 1_000_000
+
+
+class SourceCondition:
+    """The matrices of Theorem 2's condition plus a multiple of the identity.
+
+    Args:
+        condition: The condition without it.
+        source: The multiple.
+    """
+
+    def __init__(self, condition: RateCondition, source: float) -> None:
+        """Keep both."""
+        self.condition, self.source = condition, source
+
+    def start(self) -> Interval:
+        """Return cells that cover the set."""
+        return self.condition.start()
+
+    def examine(self, cells: Interval) -> Examined:
+        """Enclose the matrices over cells (k, 3)."""
+        found = self.condition.examine(cells)
+        eye = np.eye(found.corners.shape[-1])
+        return replace(found, corners=found.corners + exact(self.source * eye))
+
+    def failure(self, cells: Interval) -> Violation | None:
+        """Return a point at which the condition fails even without the source, or None."""
+        return self.condition.failure(cells)
+
+
+@dataclass(frozen=True)
+class TubeProof:
+    """What the proof of a tube came to.
+
+    Attributes:
+        tube: The tube asked about.
+        condition: The search for a proof of its condition on the box.
+        proved: Whether the tube is proved: the condition on the whole box, W as definite as the
+            tube needs, and the tube inside the box.
+        seconds: Time taken [s].
+    """
+
+    tube: ConstantTube
+    condition: Search[Violation]
+    proved: bool
+    seconds: float
+
+
+def as_metric(tube: ConstantTube) -> Metric:
+    """Return the constant metric of a tube, for what takes a `Metric`."""
+    box = tube.proof_box
+    region = Region(
+        angle=box.angle,
+        angular_rate=box.angular_rate,
+        angle_error=max(box.angle_error, 1e-9),
+        angular_rate_error=max(box.angular_rate_error, 1e-9),
+        force=max(box.force, 1e-9),
+    )
+    values = np.linalg.eigvalsh(tube.dual)
+    return Metric(
+        coefficients=tube.dual[None],
+        contraction_rate=tube.design.rate,
+        condition_bound=float(values[-1] / values[0]),
+        control_weight=tube.control_weight,
+        scaling=np.ones(len(tube.dual)),
+        region=region,
+    )
+
+
+def prove_tube(system: CartPole, tube: ConstantTube, most_seconds: float = 60.0) -> TubeProof:
+    """Prove a tube on the continuous box of its condition, or say that there is no proof.
+
+    What is proved: for every target trajectory in `tube.plan`, from e(0) = 0, under every
+    disturbance (with what a learning error adds) of norm at most w_bar and under the control of
+    `TubeControl` at will, |c'e(t)| <= tube.output_radius(c, t) for every c and t. The metric is
+    constant, so that no disturbance enters dM/dt; the tube keeps x in the box by itself.
+
+    Args:
+        system: A cart-pole.
+        tube: The tube.
+        most_seconds: Time after which the search gives up [s].
+
+    Returns:
+        The proof.
+    """
+    start = time.monotonic()
+    condition = rate_condition(system, as_metric(tube), tube.proof_box, tube.design.rate)
+    pushed = SourceCondition(condition, tube.design.source)
+    found = search(pushed, _BATCH, _MOST_CELLS, most_seconds)
+    eye = np.eye(len(tube.dual))
+    definite = bool(negative_definite(tube.least_eigenvalue * eye - exact(tube.dual)))
+    proved = found.proved and definite and tube.contained
+    return TubeProof(tube, found, proved, time.monotonic() - start)
+
+
+@dataclass(frozen=True)
+class TubeControl:
+    """The least deviation from u_d under which V = e'W^-1 e keeps to its tube (Theorem 2, (17)).
+
+    For the ellipsoid dV/dt <= -2 alpha V - w_bar^2 / (2 alpha) ||W^-1 e||^2 without the
+    disturbance, which leaves dV/dt <= -2 alpha V + 2 alpha with it; for the others the paper's
+    dV/dt <= -2 alpha V. Closed form, for a control at will.
+
+    Attributes:
+        system: The system.
+        tube: The tube.
+    """
+
+    system: System
+    tube: ConstantTube
+
+    def terms(
+        self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return phi_0 (...) and phi_1 (..., m): v is allowed where phi_0 + phi_1'v <= 0."""
+        design = self.tube.design
+        error = state - nominal
+        pull = error @ np.linalg.inv(self.tube.dual)
+        drift = vector_field(self.system, state, nominal_control)
+        drift = drift - vector_field(self.system, nominal, nominal_control)
+        phi_0 = 2.0 * np.sum(pull * (drift + design.rate * error), axis=-1)
+        phi_0 = phi_0 + design.source * np.sum(pull * pull, axis=-1)
+        gain = control_matrix(self.system, state)
+        return phi_0, 2.0 * np.einsum("...ij,...i->...j", gain, pull)
+
+    def __call__(
+        self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
+    ) -> FloatArray:
+        """Return u*, shape (..., m).
+
+        Args:
+            state: x, shape (..., n).
+            nominal: x_d, shape (..., n).
+            nominal_control: u_d, shape (..., m).
+        """
+        phi_0, phi_1 = self.terms(state, nominal, nominal_control)
+        size = np.sum(phi_1 * phi_1, axis=-1)
+        acts = (phi_0 > 0.0) & (size > _TINY)
+        gain = np.where(acts, phi_0 / np.where(size > _TINY, size, 1.0), 0.0)
+        control: FloatArray = nominal_control - gain[..., None] * phi_1
+        return control

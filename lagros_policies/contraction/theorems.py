@@ -1,0 +1,283 @@
+"""The paper's theorems as functions, where no other module has them, with what they leave out.
+
+`tube.Tube` is Theorem 1, `tube.diverging_bound` Lemma 1, `control.robust_control` the u* of
+Theorem 2, `tube.tighten` Theorem 3 and `imitation.dataset.tube_states` the way of sampling of
+Theorem 4 that the networks were trained with.
+
+**Theorem 1 and a metric that depends on the state.** With V = e'M(x)e the disturbance moves x and
+so M: dV/dt has the term sum_i d_i e'(dM/dx_i)e, which the proof leaves out. For a metric of the
+angle alone |e'(dM/dtheta)e| <= kappa V with -kappa W <= dW/dtheta <= kappa W, so that the tube
+holds with alpha - kappa d_theta / 2 in place of alpha. A learning error enters through B, which
+moves no angle, and adds nothing to it.
+
+**Theorem 2, -nu or -2 nu.** For K = -s R^-1 B'M (s = 1 in the proof)
+
+    dM/dt + 2 sym(M A + M B K) + 2 alpha M                          times W on both sides, then nu:
+    -dW_bar/dt + 2 sym(A W_bar) - 2 s nu B R^-1 B' + 2 alpha W_bar
+
+for 2 sym(M B K) = -2 s M B R^-1 B'M. So the gain of the proof gives the -2 nu of equation (14), and
+the display in the proof, with -nu, belongs to half that gain. It is the stronger condition: where
+it holds (14) does, and not the reverse.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.dynamics import (
+    CartPole,
+    System,
+    control_matrix,
+    state_dependent_coefficient,
+)
+from lagros_policies.contraction.control import contraction_terms
+from lagros_policies.contraction.cvstem import Samples
+from lagros_policies.contraction.intervals import Interval, exact, negative_definite
+from lagros_policies.contraction.metric import Metric
+from lagros_policies.contraction.prove_box import ProofBox
+from lagros_policies.contraction.prove_motion import accelerations, jacobian_parts, metric_series
+from lagros_policies.contraction.prove_series import variable
+
+FloatArray = NDArray[np.float64]
+
+# Above what sampling finds by this share, so that the intervals can show it.
+_ROOM = 1.01
+# Rounding of a norm or an eigenvalue of a 4 by 4 matrix, relative to its Frobenius norm.
+_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class Lipschitz:
+    """A proved Lipschitz constant of x -> f(x) + B(x) u_d, for u_d that does not answer to x.
+
+    Attributes:
+        upper: L_f, proved: ||d(f + B u_d)/dx|| is nowhere larger [1/s].
+        lower: The largest norm that was found at a point [1/s].
+        growth: Proved bound of the largest eigenvalue of the symmetric part, which also bounds the
+            growth of an error, and is smaller [1/s].
+        seconds: Time taken [s].
+    """
+
+    upper: float
+    lower: float
+    growth: float
+    seconds: float
+
+
+def metric_drift(metric: Metric, angle: float, cells: int = 2000) -> float:
+    """Return a proved kappa [1/rad] with -kappa W <= dW/dtheta <= kappa W for |theta| <= angle.
+
+    Args:
+        metric: The metric; for a constant one kappa is zero.
+        angle: Largest |theta| [rad].
+        cells: Equal intervals of the angle.
+
+    Raises:
+        ValueError: It cannot be shown with so many cells.
+    """
+    if metric.degree == 0:
+        return 0.0
+    # W is even in the angle: one half of it will do.
+    ends = np.linspace(0.0, angle, cells + 1)
+    angles = Interval(ends[:-1], ends[1:])
+    middle = angles.midpoint
+    gap = (angles - middle)[:, None, None]
+    # About the midpoint, where the large coefficients of both signs cancel.
+    here = metric_series(metric, variable(exact(middle), 2))
+    near = metric_series(metric, variable(angles, 2))
+    dual = here.derivative(0) + near.derivative(1) * gap
+    slope = here.derivative(1) + near.derivative(2) * gap
+    values, vectors = np.linalg.eigh(dual.midpoint)
+    if values.min() <= 0.0:
+        raise ValueError(f"W_bar is not positive definite for |theta| <= {angle}")
+    root = vectors / np.sqrt(values)[:, None, :]
+    relative = np.swapaxes(root, -1, -2) @ slope.midpoint @ root
+    found = float(np.abs(np.linalg.eigvalsh(relative)).max())
+    for room in (_ROOM, _ROOM**5, _ROOM**20):
+        bound = dual * (found * room)
+        if np.all(negative_definite(slope - bound) & negative_definite(-slope - bound)):
+            return found * room
+    raise ValueError(f"kappa={found:.3g} is not shown with cells={cells}: use more cells")
+
+
+def disturbed_rate(metric: Metric, drift: float, angle_disturbance: float) -> float:
+    """Return alpha - kappa d_theta / 2, the rate of Theorem 1 with the disturbance in dM/dt [1/s].
+
+    Args:
+        metric: The metric.
+        drift: kappa of `metric_drift` [1/rad].
+        angle_disturbance: Bound of the disturbance of the angle's own equation [rad/s]; d_bar, if
+            it is not known to be less, and zero if only the rates are disturbed.
+    """
+    return metric.contraction_rate - 0.5 * drift * angle_disturbance
+
+
+def lipschitz_constant(system: CartPole, box: ProofBox, cells: int = 2000) -> Lipschitz:
+    """Bound the Lipschitz constant L_f of Lemma 1 on a box, soundly.
+
+    The Jacobian is affine in the push u_d - mu_c dp/dt, the rate and its square, and a norm is
+    convex: its corners decide, and intervals cover the angle between.
+
+    Args:
+        system: A cart-pole.
+        box: Where x, x_d and u_d lie; its errors do not matter. A lean is not supported.
+        cells: Equal intervals of the angle.
+
+    Raises:
+        ValueError: The box has a lean.
+    """
+    if box.lean:
+        raise ValueError(f"lean={box.lean!r} must be 0: state the force of the box instead")
+    start = time.monotonic()
+    ends = np.linspace(-box.angle, box.angle, cells + 1)
+    parts = jacobian_parts(system, accelerations(system, Interval(ends[:-1], ends[1:]), 1))
+    push = float((exact(box.velocity) * system.cart_friction + box.force).upper)
+    rate = box.angular_rate
+    upper = lower = growth = 0.0
+    zero = np.zeros((1, 1, 1))
+    for force in (-push, push):
+        for speed in (-rate, rate):
+            for square, real in ((0.0, rate == 0.0), (math.nextafter(rate * rate, math.inf), True)):
+                slope = parts.at(0, zero + force, zero, zero + speed, zero + square)
+                middle, reach = slope.midpoint, np.linalg.norm(slope.radius, axis=(-1, -2))
+                size = np.linalg.norm(middle, ord=2, axis=(-1, -2))
+                slack = reach + _ROUNDING * np.linalg.norm(middle, axis=(-1, -2))
+                upper = max(upper, float((size + slack).max()))
+                lower = max(lower, float((size - slack).max()) if real else 0.0)
+                symmetric = 0.5 * (middle + np.swapaxes(middle, -1, -2))
+                growth = max(growth, float((np.linalg.eigvalsh(symmetric)[:, -1] + slack).max()))
+    return Lipschitz(upper, lower, growth, time.monotonic() - start)
+
+
+def gain_residual(
+    system: System, metric: Metric, samples: Samples, share: float = 1.0
+) -> FloatArray:
+    """Return the largest eigenvalue of Theorem 2's condition for K = -share B'M, shape (s,).
+
+    Of -dW_bar/dt + 2 sym(A W_bar) - 2 share nu B B' + 2 alpha W_bar, relative to the trace of
+    W_bar: a share of 1 is equation (14), a share of 1/2 the display in its proof.
+
+    Args:
+        system: The system.
+        metric: The metric.
+        samples: Where to look.
+        share: s.
+    """
+    slope = state_dependent_coefficient(
+        system, samples.state, samples.nominal, samples.nominal_control
+    )
+    dual, gain = metric.dual(samples.state), control_matrix(system, samples.state)
+    product = slope @ dual
+    left = product + np.swapaxes(product, -1, -2) - metric.dual_rate(samples.state)
+    left = left + 2.0 * metric.contraction_rate * dual
+    left = left - 2.0 * share * metric.control_weight * gain @ np.swapaxes(gain, -1, -2)
+    worst = np.linalg.eigvalsh(left)[:, -1] / np.trace(dual, axis1=-2, axis2=-1)
+    return np.asarray(worst, dtype=np.float64)
+
+
+def feasibility_residual(system: System, metric: Metric, samples: Samples) -> FloatArray:
+    """Return by how much u_d - nu B'W_bar^-1 e misses the condition (18), over V, shape (s,) [1/s].
+
+    It is the control that the proof of Theorem 2 names; where the figure is not positive the
+    program for u* is feasible.
+
+    Args:
+        system: The system.
+        metric: The metric.
+        samples: x, x_d and u_d; e = x - x_d must not be zero.
+    """
+    error = samples.state - samples.nominal
+    phi_0, phi_1 = contraction_terms(
+        system,
+        metric,
+        metric.contraction_rate,
+        samples.state,
+        samples.nominal,
+        samples.nominal_control,
+    )
+    pull = np.einsum("...ij,...j->...i", metric.matrix(samples.state), error)
+    gain = control_matrix(system, samples.state)
+    deviation = -metric.control_weight * np.einsum("...ij,...i->...j", gain, pull)
+    energy = np.sum(pull * error, axis=-1)
+    missing: FloatArray = (phi_0 + np.sum(phi_1 * deviation, axis=-1)) / energy
+    return missing
+
+
+def contraction_distance(
+    system: System, metric: Metric, samples: Samples, control: FloatArray
+) -> FloatArray:
+    """Return how far controls are from the nearest one that contracts, shape (s,).
+
+    Theorem 1 needs of eps_l no more than this: any control that meets (18) may stand for u*. Where
+    no control has an effect and u_d does not contract, it is infinite.
+
+    Args:
+        system: The system.
+        metric: The metric.
+        samples: x, x_d and u_d.
+        control: u, shape (s, m).
+    """
+    phi_0, phi_1 = contraction_terms(
+        system,
+        metric,
+        metric.contraction_rate,
+        samples.state,
+        samples.nominal,
+        samples.nominal_control,
+    )
+    missing = phi_0 + np.sum(phi_1 * (control - samples.nominal_control), axis=-1)
+    size = np.linalg.norm(phi_1, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance: FloatArray = np.where(missing > 0.0, missing / size, 0.0)
+    return distance
+
+
+def tube_ball(rng: np.random.Generator, nominal: FloatArray, radius: FloatArray) -> FloatArray:
+    """Draw x uniformly from S(x_d), the ball of radius r_l(t) around x_d (Theorem 4).
+
+    Args:
+        rng: Random generator.
+        nominal: x_d(t), shape (..., n).
+        radius: r_l(t), shape (...).
+
+    Returns:
+        One state for each, shape (..., n).
+
+    Raises:
+        ValueError: A radius is negative.
+    """
+    if np.any(radius < 0.0):
+        raise ValueError(f"radius={float(np.min(radius))!r} must be >= 0")
+    direction = rng.standard_normal(nominal.shape)
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    size = radius * rng.random(nominal.shape[:-1]) ** (1.0 / nominal.shape[-1])
+    states: FloatArray = nominal + size[..., None] * direction
+    return states
+
+
+def tube_ellipsoid(
+    rng: np.random.Generator, nominal: FloatArray, dual: FloatArray, energy: FloatArray
+) -> FloatArray:
+    """Draw x uniformly from the tube in its own shape, e'W^-1 e <= energy.
+
+    Args:
+        rng: Random generator.
+        nominal: x_d(t), shape (..., n).
+        dual: W, shape (n, n).
+        energy: Bound of e'W^-1 e, shape (...).
+
+    Returns:
+        One state for each, shape (..., n).
+
+    Raises:
+        numpy.linalg.LinAlgError: W is not positive definite.
+    """
+    zero = np.zeros_like(nominal)
+    ball = tube_ball(rng, zero, np.sqrt(energy))
+    states: FloatArray = nominal + ball @ np.linalg.cholesky(dual).T
+    return states

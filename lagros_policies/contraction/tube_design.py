@@ -1,0 +1,349 @@
+"""Constant metrics that make a tube small: the paper's, one for an output, and the ellipsoid.
+
+With W constant, A the SDC matrix and w = d + B(u_L - u*), ||w|| <= w_bar, three programs in W:
+
+    paper       -2 nu B B' + 2 sym(A W) + 2 alpha W <= 0,  I <= W,          least lambda_max(W)
+    output c    the same,                                                   least c'W c
+    ellipsoid   -2 nu B B' + 2 sym(A W) + 2 alpha W + w_bar^2 / (2 alpha) I <= 0,
+                                                      least lambda_max(W), or c'W c
+
+The first two give ||e||_M <= w_bar / alpha at most (Theorem 1, lambda_max(M) = 1), so that
+|c'e| <= sqrt(c'W c) w_bar / alpha. They bound the push of a disturbance by its largest in any
+direction. The third weighs it by direction (S-procedure for a peak-bounded w, Boyd et al. 1994,
+section 6.1.3): for V = e'W^-1 e
+
+    dV/dt <= -2 alpha V + 2 alpha,    so that V <= 1 - exp(-2 alpha t) after V(0) = 0
+
+and |c'e| <= sqrt(c'W c (1 - exp(-2 alpha t))): the ellipsoid V <= 1 is never left.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from lagros_envs.dynamics import System, control_matrix, jacobian
+from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
+from lagros_policies.contraction.cvstem import InfeasibleError, _svec, _symmetric_basis
+from lagros_policies.contraction.prove import ProofBox
+
+FloatArray = NDArray[np.float64]
+Method = Literal["paper", "output", "ellipsoid"]
+
+# Angles of x at which the condition is imposed; it is even in the state, so half of them do.
+_ANGLES = 6
+# Rounds in which the errors that the tube allows, and those that the condition allows, meet.
+_ROUNDS = 40
+# The errors allowed exceed those of the tube by this share, so that the rounds end.
+_ROOM = 1.01
+# Far above the rounding of an eigenvalue of a 4 by 4 matrix whose condition is below 1e5.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class PlanBox:
+    """Where the target trajectory lies; the position is free.
+
+    Attributes:
+        angle: Largest |theta_d| [rad].
+        velocity: Largest |dp_d/dt| [m/s].
+        angular_rate: Largest |dtheta_d/dt| [rad/s].
+        force: Largest |u_d| [N].
+
+    Raises:
+        ValueError: A bound is negative or not finite.
+    """
+
+    angle: float = 0.1
+    velocity: float = 1.0
+    angular_rate: float = 0.2
+    force: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the bounds."""
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name}={value!r} must be finite and >= 0")
+
+    def with_errors(self, error: FloatArray) -> ProofBox:
+        """Return the box of x and x_d for errors of at most `error`, shape (4,).
+
+        Raises:
+            ValueError: The angle reaches pi/2.
+        """
+        return ProofBox(
+            angle=self.angle + float(error[ANGLE]),
+            velocity=self.velocity + float(error[VELOCITY]),
+            angular_rate=self.angular_rate + float(error[ANGULAR_RATE]),
+            force=self.force,
+            angle_error=float(error[ANGLE]),
+            angular_rate_error=float(error[ANGULAR_RATE]),
+        )
+
+
+@dataclass(frozen=True)
+class TubeDesign:
+    """What a constant metric is designed for.
+
+    Attributes:
+        method: One of the three programs.
+        rate: alpha [1/s].
+        output: c, shape (n,): what the tube should be narrow in; None for the whole state.
+        disturbance_bound: w_bar, in units of the state per second.
+        control_penalty: lambda, weight of nu in the objective; for the ellipsoid, whose W grows
+            with the square of the disturbance, in units of w_bar^2.
+        floor: Least eigenvalue of the ellipsoid's W in units of w_bar^2 / (2 alpha): a W that is
+            almost singular is hard to prove.
+        margin: Added to alpha at the samples, so that the condition holds between them [1/s].
+
+    Raises:
+        ValueError: A value is out of range, or the output does not fit the method.
+    """
+
+    method: Method = "ellipsoid"
+    rate: float = 0.8
+    output: tuple[float, ...] | None = None
+    disturbance_bound: float = 0.75
+    control_penalty: float = 0.02
+    floor: float = 0.03
+    margin: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name in ("rate", "disturbance_bound", "control_penalty", "floor"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name}={value!r} must be positive and finite")
+        if not (math.isfinite(self.margin) and self.margin >= 0.0):
+            raise ValueError(f"margin={self.margin!r} must be finite and >= 0")
+        if self.method == "output" and self.output is None:
+            raise ValueError("output=None: method='output' needs the direction c")
+        if self.method == "paper" and self.output is not None:
+            raise ValueError("output must be None for method='paper': use method='output'")
+
+    @property
+    def source(self) -> float:
+        """w_bar^2 / (2 alpha), what the disturbance adds to the condition; 0 but for the ellipsoid.
+
+        The margin counts as part of alpha in the program, not here.
+        """
+        return self.disturbance_bound**2 / (2.0 * self.rate) if self.method == "ellipsoid" else 0.0
+
+
+@dataclass(frozen=True)
+class ConstantTube:
+    """A tube of a constant metric around target trajectories of a box.
+
+    Attributes:
+        design: What it was designed for.
+        dual: W, shape (4, 4). For the ellipsoid V = e'W^-1 e <= 1 is the tube; else I <= W.
+        control_weight: nu.
+        plan: Where the target trajectories lie.
+        error: Errors for which the condition was imposed, shape (4,).
+    """
+
+    design: TubeDesign
+    dual: FloatArray
+    control_weight: float
+    plan: PlanBox
+    error: FloatArray
+
+    @property
+    def energy(self) -> float:
+        """The bound of V = e'W^-1 e, as time goes on."""
+        if self.design.method == "ellipsoid":
+            return 1.0
+        return (self.design.disturbance_bound / self.design.rate) ** 2 / self.least_eigenvalue
+
+    @property
+    def least_eigenvalue(self) -> float:
+        """A number below the least eigenvalue of W: lambda_max(M) is at most one over it."""
+        return float(np.linalg.eigvalsh(self.dual)[0]) * (1.0 - _ROUNDING)
+
+    @property
+    def steady_radius(self) -> float:
+        """The bound of ||e|| as time goes on."""
+        largest = float(np.linalg.eigvalsh(self.dual)[-1]) * (1.0 + _ROUNDING)
+        return math.sqrt(self.energy * largest)
+
+    @property
+    def steady_outputs(self) -> FloatArray:
+        """The bounds of each |e_i| as time goes on, shape (4,)."""
+        bounds: FloatArray = np.sqrt(self.energy * np.diag(self.dual)) * (1.0 + _ROUNDING)
+        return bounds
+
+    @property
+    def contained(self) -> bool:
+        """Whether the tube stays where the condition was imposed, without which it proves nothing.
+
+        The position is free.
+        """
+        places = [ANGLE, VELOCITY, ANGULAR_RATE]
+        return bool(np.all(self.steady_outputs[places] <= self.error[places]))
+
+    @property
+    def largest_bound(self) -> float:
+        """The largest w_bar for which the tube is contained; for the ellipsoid its own or zero."""
+        if self.design.method == "ellipsoid":
+            return self.design.disturbance_bound if self.contained else 0.0
+        places = [ANGLE, VELOCITY, ANGULAR_RATE]
+        room = float(np.min(self.error[places] / self.steady_outputs[places]))
+        return room * self.design.disturbance_bound
+
+    @property
+    def proof_box(self) -> ProofBox:
+        """The box of x, x_d and u_d on which the condition is asked for."""
+        return self.plan.with_errors(self.error)
+
+    def share(self, time: Any) -> Any:
+        """Return which share of the steady radius is reached at times t [s] after e(0) = 0."""
+        rate = self.design.rate
+        if self.design.method == "ellipsoid":
+            return np.sqrt(-np.expm1(-2.0 * rate * np.asarray(time, dtype=np.float64)))
+        return -np.expm1(-rate * np.asarray(time, dtype=np.float64))
+
+    def output_radius(self, direction: FloatArray, time: Any) -> Any:
+        """Return the bound of |c'e(t)| for c of shape (4,) at times t [s] after e(0) = 0."""
+        return math.sqrt(self.energy * float(direction @ self.dual @ direction)) * self.share(time)
+
+
+def design_constant(
+    system: System, plan: PlanBox, error: FloatArray, design: TubeDesign
+) -> ConstantTube:
+    """Solve one of the three programs on samples of a box (not yet proved).
+
+    Args:
+        system: A cart-pole.
+        plan: Where the target trajectories lie.
+        error: Largest |x - x_d|, shape (4,); that of the position does not matter.
+        design: What to design.
+
+    Returns:
+        The tube.
+
+    Raises:
+        InfeasibleError: There is no such constant metric.
+        RuntimeError: The solver stopped for another reason.
+        ValueError: The box reaches pi/2.
+    """
+    slope, gain = _samples(system, plan.with_errors(error))
+    dual, weight, status = _solve(slope, gain, design)
+    if dual is None:
+        if "Infeasible" in status:
+            raise InfeasibleError(
+                f"no constant metric with alpha={design.rate} exists for {plan} and errors up to "
+                f"{np.round(error, 3).tolist()}: lower alpha or the disturbance bound"
+            )
+        raise RuntimeError(f"the program stopped with status {status} for {design}")
+    return ConstantTube(design, dual, weight, plan, error)
+
+
+def design_contained(system: System, plan: PlanBox, design: TubeDesign) -> ConstantTube:
+    """Design a tube on the errors that it allows itself: from none, until both meet.
+
+    Args:
+        system: A cart-pole.
+        plan: Where the target trajectories lie.
+        design: What to design.
+
+    Returns:
+        A tube that is contained in the box of its condition.
+
+    Raises:
+        InfeasibleError: The errors outgrow the box on which there is a metric.
+        RuntimeError: The solver stopped, or the two did not meet.
+    """
+    error = np.zeros(4)
+    for _ in range(_ROUNDS):
+        try:
+            tube = design_constant(system, plan, error, design)
+        except ValueError as problem:
+            raise InfeasibleError(
+                f"no contained tube for disturbance_bound={design.disturbance_bound} around "
+                f"{plan}: {problem}"
+            ) from problem
+        if tube.contained:
+            return tube
+        error = np.maximum(error, _ROOM * tube.steady_outputs)
+    raise RuntimeError(f"the errors still grow after {_ROUNDS} rounds for {design}")
+
+
+def _samples(system: System, box: ProofBox) -> tuple[FloatArray, FloatArray]:
+    """Return Jacobians at y, (s, 4, 4), and B at x, (s, 4, 1), at corners of the box."""
+    angles = np.linspace(0.0, box.angle, _ANGLES)
+    gaps = np.array([-1.0, 0.0, 1.0]) * box.angle_error
+    signs = np.array([-1.0, 1.0])
+    # Friction makes a velocity act like a force: the two are extreme together.
+    angle, gap, rate, drive = (
+        part.ravel() for part in np.meshgrid(angles, gaps, signs, signs, indexing="ij")
+    )
+    x = np.zeros((len(angle), 4))
+    x[:, ANGLE] = angle
+    y = np.zeros_like(x)
+    y[:, ANGLE] = np.clip(angle + gap, -box.angle, box.angle)
+    y[:, ANGULAR_RATE] = rate * box.angular_rate
+    y[:, VELOCITY] = -drive * box.velocity
+    slope, _ = jacobian(system, y, drive[:, None] * box.force)
+    return slope, control_matrix(system, x)
+
+
+def _solve(
+    slope: FloatArray, gain: FloatArray, design: TubeDesign
+) -> tuple[FloatArray | None, float, str]:
+    """Minimise t + lambda nu over W, nu and t; return W, nu and the solver's status."""
+    import clarabel
+
+    n = slope.shape[-1]
+    basis = _symmetric_basis(n)
+    size = len(basis)
+    product = np.einsum("sab,jbc->sjac", slope, basis)
+    by_dual = product + np.swapaxes(product, -1, -2)
+    by_dual = by_dual + 2.0 * (design.rate + design.margin) * basis
+    by_weight = -2.0 * gain @ np.swapaxes(gain, -1, -2)
+    eye = np.eye(n)
+    floor = design.floor * design.source if design.method == "ellipsoid" else 1.0
+    # Rows z + slack = right, slack in a cone: (W, nu, t) in columns.
+    blocks = [
+        np.column_stack([_svec(part).T, _svec(push), np.zeros(size)])
+        for part, push in zip(by_dual, by_weight, strict=True)
+    ]
+    rights = [-_svec(design.source * eye)] * len(slope)
+    blocks.append(np.column_stack([-_svec(basis).T, np.zeros((size, 2))]))
+    rights.append(-floor * _svec(eye))
+    cones: list[Any] = [clarabel.PSDTriangleConeT(n)] * (len(slope) + 1)
+    if design.output is None:
+        blocks.append(np.column_stack([_svec(basis).T, np.zeros(size), -_svec(eye)]))
+        rights.append(np.zeros(size))
+        cones.append(clarabel.PSDTriangleConeT(n))
+    else:
+        c = np.asarray(design.output)
+        blocks.append(np.concatenate([basis @ c @ c, [0.0, -1.0]])[None])
+        rights.append(np.zeros(1))
+        cones.append(clarabel.NonnegativeConeT(1))
+    cost = np.zeros(size + 2)
+    unit = design.disturbance_bound**2 if design.method == "ellipsoid" else 1.0
+    cost[-2:] = design.control_penalty * unit, 1.0
+    options: Any = clarabel.DefaultSettings()
+    options.verbose = False
+    options.max_threads = 1
+    answer = clarabel.DefaultSolver(
+        sparse.csc_matrix((size + 2, size + 2)),
+        cost,
+        sparse.csc_matrix(np.vstack(blocks)),
+        np.concatenate(rights),
+        cones,
+        options,
+    ).solve()
+    status = str(answer.status)
+    # An almost solved program is accepted only because every tube is proved afterwards.
+    if status not in ("Solved", "AlmostSolved"):
+        return None, 0.0, status
+    values = np.array(answer.x)
+    dual = np.einsum("j,jab->ab", values[:size], basis)
+    return dual, float(values[size]), status

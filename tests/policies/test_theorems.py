@@ -1,0 +1,174 @@
+"""The theorems as functions, against sampling, finite differences and their own derivation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lagros_policies.contraction import Samples
+from lagros_policies.contraction.prove_box import ProofBox
+from lagros_policies.contraction.theorems import (
+    contraction_distance,
+    disturbed_rate,
+    feasibility_residual,
+    gain_residual,
+    lipschitz_constant,
+    metric_drift,
+    tube_ball,
+    tube_ellipsoid,
+)
+
+
+def test_the_drift_bounds_the_relative_slope_of_the_metric_closely(metric, constant_metric):
+    drift = metric_drift(metric, 0.8)
+    states = np.zeros((801, 4))
+    states[:, 1] = np.linspace(-0.8, 0.8, 801)
+    step = 1e-6
+    ahead, behind = states.copy(), states.copy()
+    ahead[:, 1] += step
+    behind[:, 1] -= step
+    slope = (metric.dual(ahead) - metric.dual(behind)) / (2 * step)
+    relative = np.linalg.solve(metric.dual(states), slope)
+    largest = np.abs(np.linalg.eigvals(relative)).max()
+    assert largest <= drift * (1 + 1e-6)
+    assert drift <= 1.25 * largest
+    assert metric_drift(constant_metric, 0.8) == 0.0
+
+
+def test_the_disturbed_rate_covers_what_moves_the_metric(metric, oracle):
+    """dV/dt under a disturbance of the angle exceeds the paper's bound, and not ours."""
+    drift, bound = metric_drift(metric, 0.8), 0.3
+    rng = np.random.default_rng(2)
+    state = rng.uniform(-0.4, 0.4, (4000, 4))
+    nominal = state - rng.uniform(-0.3, 0.3, (4000, 4))
+    h = 1e-6
+    push = np.zeros((4000, 4))
+    push[:, 1] = bound * rng.choice([-1.0, 1.0], 4000)
+    # What the disturbance adds to dV/dt, by moving x alone and keeping e.
+    moved = oracle.energy(metric, state + h * push, nominal + h * push)
+    back = oracle.energy(metric, state - h * push, nominal - h * push)
+    added = (moved - back) / (2 * h)
+    energy = oracle.energy(metric, state, nominal)
+    lost = metric.contraction_rate - disturbed_rate(metric, drift, bound)
+    assert np.all(added <= 2.0 * lost * energy + 1e-7)
+    assert added.max() > 0.0
+
+
+def test_the_lipschitz_constant_encloses_sampled_norms(system, oracle):
+    box = ProofBox(0.7, 1.0, 2.0, 6.0)
+    found = lipschitz_constant(system, box, cells=500)
+    rng = np.random.default_rng(0)
+    state = rng.uniform(-1, 1, (4000, 4)) * [1.0, 0.7, 1.0, 2.0]
+    force = rng.choice([-6.0, 6.0], (4000, 1))
+    slope = oracle.jacobian(lambda x: oracle.rates(x, force), state)
+    norms = np.linalg.norm(slope, ord=2, axis=(1, 2))
+    growth = np.linalg.eigvalsh(0.5 * (slope + np.swapaxes(slope, 1, 2)))[:, -1]
+    assert norms.max() <= found.upper
+    assert 0.9 * found.lower <= norms.max()
+    assert found.lower <= found.upper <= 1.1 * found.lower
+    assert growth.max() <= found.growth <= found.upper
+
+
+def test_a_box_with_a_lean_is_refused(system):
+    with pytest.raises(ValueError, match="lean"):
+        lipschitz_constant(system, replace(ProofBox(0.3, 1.0, 1.0, 1.0), lean=1.0))
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0, 2.0])
+def test_the_gain_of_the_proof_gives_minus_two_nu(share, system, metric, samples, oracle):
+    """W (dM/dt + 2 sym(M A + M B K) + 2 alpha M) W nu, from M and K themselves."""
+    few = samples.take(np.arange(50))
+    state, nominal, control = few.state, few.nominal, few.nominal_control
+    nu = metric.control_weight
+    big = nu * np.linalg.inv(metric.dual(state))
+    gain = oracle.input_matrix(state)
+    feedback = -share * np.swapaxes(gain, 1, 2) @ big
+    slope = oracle.sdc(state, nominal, control)
+    inner = big @ (slope + gain @ feedback)
+    h = 1e-6
+    turned = state.copy()
+    turned[:, 1] += h * state[:, 3]
+    behind = state.copy()
+    behind[:, 1] -= h * state[:, 3]
+    rate = (np.linalg.inv(metric.dual(turned)) - np.linalg.inv(metric.dual(behind))) * nu / (2 * h)
+    left = rate + inner + np.swapaxes(inner, 1, 2) + 2 * metric.contraction_rate * big
+    dual = metric.dual(state)
+    congruent = dual @ left @ dual / nu
+    expected = np.linalg.eigvalsh(congruent)[:, -1] / np.trace(dual, axis1=1, axis2=2)
+    found = gain_residual(system, metric, few, share)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_the_display_in_the_proof_is_stronger_than_the_equation(system, metric, samples):
+    equation = gain_residual(system, metric, samples, 1.0)
+    display = gain_residual(system, metric, samples, 0.5)
+    assert np.all(equation <= display + 1e-12)
+    assert equation.max() < 0.0
+    # Not the reverse: a nu for which the equation holds and the display does not.
+    tight = metric
+    while (
+        gain_residual(
+            system, replace(tight, control_weight=0.7 * tight.control_weight), samples
+        ).max()
+        < 0
+    ):
+        tight = replace(tight, control_weight=0.7 * tight.control_weight)
+    assert gain_residual(system, tight, samples, 1.0).max() < 0.0
+    assert gain_residual(system, tight, samples, 0.5).max() > 0.0
+
+
+def test_the_program_for_the_control_is_feasible_where_the_condition_holds(system, metric, pool):
+    assert feasibility_residual(system, metric, pool).max() <= 1e-9
+    wrong = replace(metric, control_weight=1e-3 * metric.control_weight)
+    assert feasibility_residual(system, wrong, pool).max() > 0.0
+
+
+def test_the_distance_is_that_of_the_nearest_control_that_contracts(system, metric, pool, oracle):
+    few = pool.take(np.arange(40))
+    control = few.nominal_control + np.linspace(-8.0, 8.0, 40)[:, None]
+    distance = contraction_distance(system, metric, few, control)
+    assert np.any(distance == 0.0)
+    assert np.any(distance > 0.1)
+    for index in range(40):
+        state, nominal = few.state[index], few.nominal[index]
+
+        def excess(force, state=state, nominal=nominal, index=index):
+            args = (metric, state, nominal, few.nominal_control[index], force)
+            energy = oracle.energy(metric, state, nominal)
+            return oracle.energy_rate(*args) + 2 * metric.contraction_rate * energy
+
+        near = [control[index] + side * distance[index] for side in (-1.0, 1.0)]
+        scale = abs(excess(control[index])) + 1e-6
+        # At that distance, on one side or the other, a control contracts; nearer by, none does.
+        assert min(excess(force) for force in near) <= 1e-4 * scale
+        if distance[index] > 1e-3:
+            closer = [control[index] + 0.99 * side * distance[index] for side in (-1.0, 1.0)]
+            assert min(excess(force) for force in closer) > 0.0
+
+
+def test_states_fill_the_ball_and_the_ellipsoid_evenly():
+    rng = np.random.default_rng(1)
+    nominal = rng.standard_normal((40_000, 4))
+    radius = rng.uniform(0.0, 2.0, 40_000)
+    shares = np.linalg.norm(tube_ball(rng, nominal, radius) - nominal, axis=1) / radius
+    assert shares.max() <= 1.0 + 1e-12
+    # Uniform in four dimensions: the fourth power of the share is uniform in [0, 1].
+    assert np.mean(shares**4) == pytest.approx(0.5, abs=0.01)
+    root = rng.standard_normal((4, 4))
+    dual = root @ root.T + np.eye(4)
+    error = tube_ellipsoid(rng, nominal, dual, np.full(40_000, 2.0)) - nominal
+    energy = np.sum(np.linalg.solve(dual, error.T).T * error, axis=1)
+    assert energy.max() <= 2.0 * (1 + 1e-9)
+    # Uniform in an ellipsoid: the covariance is W energy / (n + 2).
+    np.testing.assert_allclose(error.T @ error / 40_000, dual * 2.0 / 6.0, atol=0.06)
+
+
+def test_negative_radii_are_refused():
+    with pytest.raises(ValueError, match="radius"):
+        tube_ball(np.random.default_rng(0), np.zeros((1, 4)), np.array([-1.0]))
+
+
+def test_samples_are_what_the_residuals_take(system, metric):
+    one = Samples(np.full((1, 4), 0.1), np.zeros((1, 4)), np.zeros((1, 1)))
+    assert gain_residual(system, metric, one).shape == (1,)
+    assert feasibility_residual(system, metric, one).shape == (1,)
