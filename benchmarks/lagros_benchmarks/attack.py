@@ -1,0 +1,188 @@
+"""`lagros attack`: search the bounded disturbance that a policy stands worst.
+
+Only the standard library and typer are imported here; the command imports the rest.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from lagros_benchmarks.worst_case_attack import AttackSettings
+    from lagros_benchmarks.worst_case_replay import Outcome
+
+BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
+# Flights per episode: a flight of six spacecraft costs what a hundred of a cart-pole do.
+BUDGETS = {"cartpole": 1000, "spacecraft": 100}
+EPISODES = {"cartpole": 10, "spacecraft": 3}
+
+
+def attack(
+    task: Annotated[str, typer.Argument(help="cartpole or spacecraft.")],
+    policy: Annotated[
+        str, typer.Option(metavar="NAME", help="A policy of the task, as for `lagros bench`.")
+    ] = "lagros",
+    goal: Annotated[
+        str,
+        typer.Option(
+            help="What to break: tube (||x - x_d||), success, or clearance (a fall, a collision)."
+        ),
+    ] = "success",
+    bound: Annotated[
+        float | None,
+        typer.Option(
+            metavar="D",
+            help="Bound d̄ of the disturbance, in units of the state per second. "
+            "(default: 0.75 for cartpole, 0.4 for spacecraft)",
+        ),
+    ] = None,
+    episodes: Annotated[
+        int | None,
+        typer.Option(help="Episodes, each with its own worst case. (default: 10; spacecraft 3)"),
+    ] = None,
+    budget: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Flights per episode. (default: 1000; spacecraft 100)"),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of episodes and search.")] = 0,
+    method: Annotated[
+        str,
+        typer.Option(help="Of random, cross-entropy, cma, gradient, hybrid; cartpole only."),
+    ] = "hybrid",
+    safety_filter: Annotated[
+        bool, typer.Option("--safety-filter", help="Put the safety filter on the policy.")
+    ] = False,
+    json: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", dir_okay=False, help="All figures, as JSON."),
+    ] = None,
+    npz: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", dir_okay=False, help="The sequences found, to replay."),
+    ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            dir_okay=False,
+            help="Fly the sequences of such a file again, and fail where a figure differs.",
+        ),
+    ] = None,
+) -> None:
+    """Search the worst bounded disturbance, fly it, and hold the certificate against it."""
+    from lagros_benchmarks.cli import fail
+
+    sys.path.insert(0, os.getcwd())
+    try:
+        if replay is not None:
+            _replay(task, replay)
+            return
+        settings = _settings(task, policy, goal, bound, episodes, budget, seed, method)
+        if safety_filter:
+            from dataclasses import replace
+
+            settings = replace(settings, safety_filter=True)
+        _search(settings, json, npz)
+    except (ValueError, OSError) as error:
+        fail(error)
+    except ImportError as error:
+        fail(error, status=1)
+
+
+def _settings(
+    task: str,
+    policy: str,
+    goal: str,
+    bound: float | None,
+    episodes: int | None,
+    budget: int | None,
+    seed: int,
+    method: str,
+) -> AttackSettings:
+    from lagros_benchmarks.settings import check_task
+    from lagros_benchmarks.worst_case import SearchSettings
+    from lagros_benchmarks.worst_case_attack import AttackSettings
+
+    check_task(task)
+    flights = BUDGETS[task] if budget is None else budget
+    population = 30 if task == "cartpole" else 16
+    return AttackSettings(
+        task=task,
+        policy=policy,
+        goal=goal,
+        bound=BOUNDS[task] if bound is None else bound,
+        episodes=EPISODES[task] if episodes is None else episodes,
+        seed=seed,
+        search=SearchSettings(method, budget=flights, population=population),
+    )
+
+
+def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> None:
+    from lagros_benchmarks.files import write_json
+    from lagros_benchmarks.worst_case_attack import run_attack
+    from lagros_benchmarks.worst_case_replay import save_worst_cases
+
+    found = run_attack(settings, lambda text: typer.echo(text, err=True))
+    for line in summary(found.row):
+        typer.echo(line)
+    if json is not None:
+        write_json(json, {"command": " ".join(["lagros", *sys.argv[1:]]), **found.row})
+        typer.echo(f"wrote {json}")
+    if npz is not None:
+        save_worst_cases(found.cases, npz)
+        typer.echo(f"wrote {npz}")
+
+
+def _replay(task: str, path: Path) -> None:
+    from lagros_benchmarks.worst_case_attack import fly_again
+    from lagros_benchmarks.worst_case_replay import load_worst_cases
+
+    cases = load_worst_cases(path)
+    if cases.command.get("task") != task:
+        raise ValueError(f"{path} is of the task {cases.command.get('task')!r}, not {task!r}")
+    differing = 0
+    for before, now in zip(cases.outcomes, fly_again(cases), strict=True):
+        same = before == now
+        differing += not same
+        typer.echo(f"{_line(now)}: {'as stored' if same else f'differs, stored {_line(before)}'}")
+    if differing:
+        typer.echo(f"lagros: {differing} of {len(cases.outcomes)} differ", err=True)
+        raise typer.Exit(1)
+
+
+def _line(outcome: Outcome) -> str:
+    broken = "broken" if outcome.broken else "held"
+    return f"seed {outcome.seed} {broken} score {outcome.score!r}"
+
+
+def summary(row: dict[str, Any]) -> list[str]:
+    """Return what an attack came to, in a few lines."""
+    worn = "+filter" if row["safety_filter"] else ""
+    count = row["episodes"]
+    lines = [
+        f"{row['task']}, {row['policy']}{worn}, goal {row['goal']}, bound {row['bound']:g}: "
+        f"{row['flights_per_episode']} flights for each of {count} episodes, "
+        f"{row['search_seconds']:.0f} s",
+        f"broken in {100 * row['broken_rate']:.0f} % of the episodes "
+        f"(random disturbance: {100 * row['random_broken_rate']:.0f} %)",
+        f"worst score {row['score_worst']:.4g}, median {row['score_median']:.4g} "
+        f"(random: worst {row['random_score_worst']:.4g})",
+    ]
+    if row.get("max_tracking_error_max") is not None:
+        lines.append(
+            f"observed tube {row['max_tracking_error_max']:.3g}; certified (Theorem 1, with the "
+            f"learning error of the flight) {row['certified_radius_max']:.4g}, reached to "
+            f"{100 * row['certified_share_max']:.2g} %, "
+            + ("CROSSED" if row["certified_crossed_rate"] else "never crossed")
+        )
+    if row.get("share_of_certified_max") is not None:
+        lines.append(
+            f"observed position error {row['max_position_error_max']:.3g} m, "
+            f"{100 * row['share_of_certified_max']:.3g} % of the certified margin"
+        )
+    return lines

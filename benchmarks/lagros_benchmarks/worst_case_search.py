@@ -1,0 +1,136 @@
+"""Optimisers over unconstrained vectors, one question and one answer at a time.
+
+They maximise. `ask` gives a population, which the caller evaluates in one batch together with the
+populations of other searches; `tell` takes the scores back.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+OPTIMISERS = ("cma", "cross-entropy", "random")
+# Share of a population that the cross-entropy method learns from, and how slowly it learns.
+_ELITE = 0.2
+_SMOOTHING = 0.7
+# It must not stand still before the budget is spent.
+_LEAST_SPREAD = 0.02
+
+
+class Search(Protocol):
+    """An optimiser of one function."""
+
+    def ask(self) -> FloatArray:
+        """Return points to evaluate, shape (population, dimension)."""
+
+    def tell(self, points: FloatArray, scores: FloatArray) -> None:
+        """Take the scores (population,) of those points; larger is better."""
+
+
+class RandomSearch:
+    """Independent normal points: what every other search must beat.
+
+    Args:
+        dimension: Number of parameters.
+        population: Points per question.
+        rng: Random generator.
+    """
+
+    def __init__(self, dimension: int, population: int, rng: np.random.Generator) -> None:
+        """Keep the settings."""
+        self._shape, self._rng = (population, dimension), rng
+
+    def ask(self) -> FloatArray:
+        """Return fresh points."""
+        return self._rng.standard_normal(self._shape)
+
+    def tell(self, points: FloatArray, scores: FloatArray) -> None:
+        """Learn nothing."""
+
+
+class CrossEntropySearch:
+    """The cross-entropy method: a normal law with a diagonal spread, fitted to the best fifth.
+
+    Args:
+        dimension: Number of parameters.
+        population: Points per question.
+        rng: Random generator.
+    """
+
+    def __init__(self, dimension: int, population: int, rng: np.random.Generator) -> None:
+        """Begin with the standard normal law."""
+        self._population, self._rng = population, rng
+        self._mean, self._spread = np.zeros(dimension), np.ones(dimension)
+
+    def ask(self) -> FloatArray:
+        """Return points drawn from the present law."""
+        noise = self._rng.standard_normal((self._population, len(self._mean)))
+        return self._mean + self._spread * noise
+
+    def tell(self, points: FloatArray, scores: FloatArray) -> None:
+        """Move mean and spread towards those of the best points."""
+        count = max(2, round(_ELITE * len(points)))
+        elite = points[np.argsort(-scores)[:count]]
+        spread = np.maximum(elite.std(axis=0), _LEAST_SPREAD)
+        self._mean += _SMOOTHING * (elite.mean(axis=0) - self._mean)
+        self._spread += _SMOOTHING * (spread - self._spread)
+
+
+class CmaSearch:
+    """CMA-ES by the package `cmaes`, begun anew when it has converged.
+
+    Args:
+        dimension: Number of parameters, at least two.
+        population: Points per question.
+        rng: Random generator.
+
+    Raises:
+        ImportError: The package `cmaes` is not installed.
+    """
+
+    def __init__(self, dimension: int, population: int, rng: np.random.Generator) -> None:
+        """Begin at the origin."""
+        self._dimension, self._population, self._rng = dimension, population, rng
+        self._strategy = self._begin(np.zeros(dimension))
+
+    def ask(self) -> FloatArray:
+        """Return points drawn from the present law."""
+        if self._strategy.should_stop():
+            self._strategy = self._begin(self._rng.standard_normal(self._dimension))
+        return np.stack([self._strategy.ask() for _ in range(self._population)])
+
+    def tell(self, points: FloatArray, scores: FloatArray) -> None:
+        """Adapt the law."""
+        # The package minimises.
+        self._strategy.tell([(x, -float(y)) for x, y in zip(points, scores, strict=True)])
+
+    def _begin(self, mean: FloatArray) -> Any:
+        from cmaes import CMA
+
+        seed = int(self._rng.integers(2**31))
+        return CMA(mean=mean, sigma=1.0, population_size=self._population, seed=seed)
+
+
+def make_search(
+    name: str, dimension: int, population: int, rng: np.random.Generator
+) -> RandomSearch | CrossEntropySearch | CmaSearch:
+    """Return an optimiser by its name, one of `OPTIMISERS`.
+
+    Raises:
+        ValueError: The name is unknown, or a number is below two.
+        ImportError: "cma" without the package `cmaes`.
+    """
+    if min(dimension, population) < 2:
+        raise ValueError(f"dimension={dimension} and population={population} must be at least 2")
+    kinds: dict[str, type[RandomSearch] | type[CrossEntropySearch] | type[CmaSearch]] = {
+        "cma": CmaSearch,
+        "cross-entropy": CrossEntropySearch,
+        "random": RandomSearch,
+    }
+    if name not in kinds:
+        raise ValueError(f"optimiser {name!r} must be one of {', '.join(OPTIMISERS)}")
+    return kinds[name](dimension, population, rng)

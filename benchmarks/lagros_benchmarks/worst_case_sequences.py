@@ -1,0 +1,189 @@
+"""Bounded sequences of a disturbance: few numbers in, d/d_bar at every control step out.
+
+Every parametrisation maps an unconstrained vector to a sequence in the unit ball, so that an
+optimiser can move freely and the bound d_bar holds whatever it proposes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.disturbances import Situation, into_unit_ball, onto_unit_sphere
+
+FloatArray = NDArray[np.float64]
+
+
+class Parametrisation(Protocol):
+    """A map from vectors to sequences in the unit ball."""
+
+    @property
+    def dimension(self) -> int:
+        """Number of parameters."""
+
+    def sequences(self, points: FloatArray) -> FloatArray:
+        """Return sequences (p, steps, channels) in the unit ball for points (p, dimension)."""
+
+
+@dataclass(frozen=True)
+class Segments:
+    """One direction per segment of the episode, always of length one.
+
+    Attributes:
+        steps: Control steps of the episode.
+        channels: Coordinates of d.
+        pieces: Segments, of equal length but for rounding.
+
+    Raises:
+        ValueError: There are more pieces than steps, or a number is below one.
+    """
+
+    steps: int
+    channels: int
+    pieces: int
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        _check(self.steps, self.channels, self.pieces)
+
+    @property
+    def dimension(self) -> int:
+        """One vector per piece."""
+        return self.pieces * self.channels
+
+    def sequences(self, points: FloatArray) -> FloatArray:
+        """Return sequences (p, steps, channels) of length one for points (p, dimension)."""
+        rays = _unit(points.reshape(len(points), self.pieces, self.channels))
+        piece = np.arange(self.steps) * self.pieces // self.steps
+        return rays[:, piece]
+
+
+@dataclass(frozen=True)
+class Knots:
+    """Vectors at equidistant knots, linear between them, shortened to length one.
+
+    Attributes:
+        steps: Control steps of the episode.
+        channels: Coordinates of d.
+        pieces: Intervals between the knots.
+
+    Raises:
+        ValueError: There are more pieces than steps, or a number is below one.
+    """
+
+    steps: int
+    channels: int
+    pieces: int
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        _check(self.steps, self.channels, self.pieces)
+
+    @property
+    def dimension(self) -> int:
+        """One vector per knot."""
+        return (self.pieces + 1) * self.channels
+
+    def sequences(self, points: FloatArray) -> FloatArray:
+        """Return sequences (p, steps, channels) in the unit ball for points (p, dimension)."""
+        values = points.reshape(len(points), self.pieces + 1, self.channels)
+        place = np.linspace(0.0, self.pieces, self.steps)
+        left = np.minimum(place.astype(np.intp), self.pieces - 1)
+        share = (place - left)[:, None]
+        return into_unit_ball((1.0 - share) * values[:, left] + share * values[:, left + 1])
+
+
+@dataclass(frozen=True)
+class Switching:
+    """One direction whose sign switches at a few free times: bang-bang.
+
+    Attributes:
+        steps: Control steps of the episode.
+        channels: Coordinates of d.
+        pieces: Constant pieces; there is one switch less.
+
+    Raises:
+        ValueError: There are more pieces than steps, or a number is below one.
+    """
+
+    steps: int
+    channels: int
+    pieces: int
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        _check(self.steps, self.channels, self.pieces)
+
+    @property
+    def dimension(self) -> int:
+        """The direction and the switching times."""
+        return self.channels + self.pieces - 1
+
+    def sequences(self, points: FloatArray) -> FloatArray:
+        """Return sequences (p, steps, channels) of length one for points (p, dimension)."""
+        direction = _unit(points[:, : self.channels])
+        # A logistic map keeps the times inside the episode without a bound for the optimiser.
+        times = self.steps / (1.0 + np.exp(-np.clip(points[:, self.channels :], -30.0, 30.0)))
+        passed = np.count_nonzero(np.arange(self.steps)[:, None] >= times[:, None, :], axis=-1)
+        sign: FloatArray = 1.0 - 2.0 * (passed % 2)
+        return np.asarray(sign[..., None] * direction[:, None, :])
+
+
+PARAMETRISATIONS: dict[str, type[Segments] | type[Knots] | type[Switching]] = {
+    "segments": Segments,
+    "knots": Knots,
+    "switching": Switching,
+}
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A given open-loop sequence as a disturbance of the environments' kind "callable".
+
+    Attributes:
+        pushes: d at every control step in units of the state per second: (steps, n), or with
+            further axes between that match the leading axes of the state.
+        period: Control period [s].
+
+    Raises:
+        ValueError: The sequence has no step, or holds a number that is not finite.
+    """
+
+    pushes: FloatArray
+    period: float
+
+    def __post_init__(self) -> None:
+        """Check the sequence."""
+        if self.pushes.ndim < 2 or len(self.pushes) == 0 or not np.all(np.isfinite(self.pushes)):
+            raise ValueError(
+                f"pushes of shape {self.pushes.shape} must be finite, with one row per control step"
+            )
+
+    @property
+    def bound(self) -> float:
+        """The largest norm of d."""
+        return float(np.linalg.norm(self.pushes, axis=-1).max())
+
+    def __call__(self, situation: Situation) -> FloatArray:
+        """Return d at the time of the situation, of the state's shape."""
+        # All worlds of a replay run on one clock; past its end the last push stays.
+        time: Any = np.max(situation.time)
+        step = min(round(float(time) / self.period), len(self.pushes) - 1)
+        return np.broadcast_to(self.pushes[step], situation.state.shape)
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    fallback = np.zeros(vectors.shape[-1])
+    fallback[0] = 1.0
+    return onto_unit_sphere(vectors, fallback)
+
+
+def _check(steps: int, channels: int, pieces: int) -> None:
+    if min(steps, channels, pieces) < 1 or pieces > steps:
+        raise ValueError(
+            f"steps={steps}, channels={channels} and pieces={pieces} must be at least 1, and "
+            "pieces at most steps"
+        )

@@ -1,0 +1,342 @@
+"""Is a certified bound ever crossed, by random, greedy or searched disturbances?
+
+Three loops, each flown at least 10,000 times under disturbances of the stated bound: all random
+kinds, constant pushes along every axis, the greedy feedback that pushes along the gradient of the
+error energy, and sequences that a search found for that very episode.
+
+- **cart-pole, held**: policies (b), by u* around its plan, and (c) every 0.1 s, against Theorem 1's
+  tube of the shipped metric with the learning error of the flight. Its hypothesis is that the state
+  stays in the metric's region; a flight is held against it until it leaves, and both are counted.
+- **cart-pole, ellipsoid**: the control of the invariant ellipsoid, which keeps the state in its own
+  region, renewed every 0.02 s in place of at will.
+- **spacecraft**: u* of the centralised policy every 0.1 s around its plans, against the certified
+  position error; an episode is one agent.
+
+    python benchmarks/studies/worst_case_certificates.py [--part NAME] [--json FILE]
+
+Finished pieces are kept in runs/worst_case/; `--fresh` begins anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from worst_case_tracking import KINDS, SEED, SPACECRAFT_BOUNDS, drawn, spacecraft_case
+
+from lagros_benchmarks import worst_case_cartpole as cartpole
+from lagros_benchmarks.files import plain, write_json
+from lagros_benchmarks.worst_case import SearchSettings, search
+from lagros_benchmarks.worst_case_certificate import TubeCheck
+from lagros_benchmarks.worst_case_settings import ATTACK
+from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.dynamics import hold_step
+from lagros_envs.files import write_atomic
+from lagros_envs.seeding import episode_seeds, episode_streams
+from lagros_envs.tube import PaperTube
+from lagros_policies.contraction.ellipsoid import TubeControl, prove_tube
+from lagros_policies.contraction.tube_design import (
+    ConstantTube,
+    PlanBox,
+    TubeDesign,
+    design_contained,
+)
+from lagros_policies.expert import CartPoleExpert
+from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.planning import CartPolePlanner
+
+FloatArray = NDArray[np.float64]
+
+COMMAND = "python benchmarks/studies/worst_case_certificates.py"
+FOLDER = Path("runs/worst_case")
+# Cart-pole, held: scenarios of each case, random draws of each kind for each.
+_HELD = (
+    ("tube-mpc", 0.05),
+    ("tube-mpc", 0.3),
+    ("tube-mpc", 0.75),
+    ("lagros", 0.3),
+    ("lagros", 0.75),
+)
+_HELD_SCENARIOS, _HELD_DRAWS = 80, 3
+_HELD_SEARCH = SearchSettings("gradient", budget=60, restarts=1)
+# Cart-pole, ellipsoid.
+_ELLIPSOID_BOUND, _ELLIPSOID_PERIOD = 0.3, 0.02
+_ELLIPSOID_SCENARIOS, _ELLIPSOID_DRAWS = 200, 8
+_ELLIPSOID_SEARCH = SearchSettings("gradient", budget=60, restarts=1)
+_PLANS = PlanBox()
+_GOAL_RANGE = 1.5
+_CHUNK = 10
+
+
+def kept(name: str, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return a piece of the study from its file, or do it and write it."""
+    path = FOLDER / f"{name}.json"
+    if path.is_file():
+        return dict(json.loads(path.read_text()))
+    begun = perf_counter()
+    piece = plain({**work(), "seconds": perf_counter() - begun})
+    write_atomic(path, json.dumps(piece))
+    return dict(piece)
+
+
+def mixed_pushes(
+    target: cartpole.CartPoleTarget, draws: int, given: SearchSettings
+) -> dict[str, FloatArray]:
+    """Return d/d_bar of all flights by how they were made, each (episodes, k, steps, 4)."""
+    settings = target.flown.settings
+    random = np.stack(
+        [
+            [
+                drawn(kind, stream, settings.steps, 4, settings.control_period)
+                for kind in KINDS
+                for stream in episode_streams(seed).disturbance.spawn(draws)
+            ]
+            for seed in target.flown.seeds
+        ]
+    )
+    starts = target.starts()
+    searched = np.stack([one.sequence for one in search(target, given, SEED)])[:, None]
+    return {
+        "random": random,
+        "constant": starts[:, :-1],
+        "greedy": starts[:, -1:],
+        "searched": searched,
+    }
+
+
+def held_case(policy: str, bound: float) -> dict[str, Any]:
+    """Fly one policy under one bound against Theorem 1's tube."""
+    expert = CartPoleExpert()
+    episodes = cartpole.draw_episodes(expert, episode_seeds(SEED, _HELD_SCENARIOS, ATTACK))
+    if policy == "tube-mpc":
+        law = cartpole.tracking_law(expert, episodes)
+    else:
+        law = cartpole.policy_law(LagrosPolicy(expert.task), episodes)
+    adversary = cartpole.energy_adversary(expert.metric)
+    target = cartpole.CartPoleTarget(episodes, law, "tube", bound, adversary)
+    check = TubeCheck(expert, episodes, bound)
+    rows = {}
+    for name, sequences in mixed_pushes(target, _HELD_DRAWS, _HELD_SEARCH).items():
+        each = sequences.shape[1]
+        which = np.repeat(np.arange(len(episodes.seeds)), each)
+        flights = cartpole.fly(
+            episodes, law, which, bound * sequences.reshape(-1, *sequences.shape[2:])
+        )
+        held = check.hold(which, flights)
+        error = np.linalg.norm(flights.states - episodes.plans[which], axis=-1)
+        error = np.where(flights.alive, error, 0.0)
+        rows[name] = {
+            "flights": len(which),
+            "crossed": int(held.certified_crossed.sum()),
+            "whole_flight_in_region": int(held.in_region.sum()),
+            "fallen": int(flights.fallen.sum()),
+            "largest_share": float(held.certified_share.max()),
+            "observed_tube": float(error.max()),
+            "certified_radius": float(held.certified_radius.max()),
+            "learning_error": float(held.learning_error.max()),
+        }
+    return {"unplanned": len(episodes.unplanned), "rows": rows}
+
+
+def ellipsoid_tube() -> ConstantTube:
+    """Return the ellipsoid that is flown."""
+    design = TubeDesign(disturbance_bound=_ELLIPSOID_BOUND)
+    return design_contained(CartPoleSettings().system, _PLANS, design)
+
+
+def gentle_episodes(tube: ConstantTube, chunk: int) -> cartpole.Episodes:
+    """Return episodes whose plans lie in the box of a tube, at a finer control period.
+
+    Goals are drawn until a plan fits, which is the law of the scenarios and not a choice among
+    outcomes: nothing has been flown yet.
+    """
+    coarse = CartPoleSettings()
+    planner = CartPolePlanner(coarse)
+    rng = np.random.default_rng([SEED, chunk])
+    ratio = round(coarse.control_period / _ELLIPSOID_PERIOD)
+    settings = replace(
+        coarse,
+        control_period=_ELLIPSOID_PERIOD,
+        # For the search alone: the certified radius in place of the published one.
+        tube=PaperTube(tube.steady_radius, tube.design.rate),
+    )
+    goals: list[FloatArray] = []
+    controls: list[FloatArray] = []
+    while len(goals) < _CHUNK:
+        start, goal = np.zeros(4), np.zeros(4)
+        goal[0] = rng.uniform(-_GOAL_RANGE, _GOAL_RANGE)
+        plan = planner.plan(start, goal)
+        box = np.array([np.inf, _PLANS.angle, _PLANS.velocity, _PLANS.angular_rate])
+        fits = np.all(np.abs(plan.states) <= box) and np.all(np.abs(plan.controls) <= _PLANS.force)
+        if plan.solved and fits:
+            goals.append(goal)
+            controls.append(np.repeat(plan.controls, ratio, axis=0))
+    forces = np.stack(controls)
+    states = [np.zeros((_CHUNK, 4))]
+    for step in range(settings.steps):
+        period = settings.control_period
+        states.append(hold_step(settings.system, states[-1], forces[:, step], period))
+    seeds = episode_seeds(SEED + 1 + chunk, _CHUNK, ATTACK)
+    return cartpole.Episodes(
+        settings, tuple(seeds), states[0], np.stack(goals), np.stack(states, axis=1), forces
+    )
+
+
+def ellipsoid_chunk(tube: ConstantTube, chunk: int) -> dict[str, Any]:
+    """Fly some scenarios against the ellipsoid."""
+    episodes = gentle_episodes(tube, chunk)
+    control = TubeControl(episodes.settings.system, tube)
+    inverse = np.linalg.inv(tube.dual)
+
+    def law(state: FloatArray, episode: Any, step: Any) -> FloatArray:
+        return control(state, episodes.plans[episode, step], episodes.controls[episode, step])
+
+    def greedy(state: FloatArray, nominal: FloatArray) -> FloatArray:
+        return (state - nominal) @ inverse
+
+    bound = _ELLIPSOID_BOUND
+    target = cartpole.CartPoleTarget(episodes, law, "tube", bound, greedy)
+    times = _ELLIPSOID_PERIOD * np.arange(1, episodes.settings.steps + 1)
+    share = tube.share(times)
+    outputs = np.stack([tube.output_radius(axis, times) for axis in np.eye(4)], axis=-1)
+    rows = {}
+    for name, sequences in mixed_pushes(target, _ELLIPSOID_DRAWS, _ELLIPSOID_SEARCH).items():
+        which = np.repeat(np.arange(_CHUNK), sequences.shape[1])
+        pushes = bound * sequences.reshape(-1, *sequences.shape[2:])
+        flights = cartpole.fly(episodes, law, which, pushes)
+        error = (flights.states - episodes.plans[which])[:, 1:]
+        energy = np.einsum("bki,ij,bkj->bk", error, inverse, error) / share**2
+        by_output = np.abs(error) / outputs
+        rows[name] = {
+            "flights": len(which),
+            "crossed": int(np.any(energy > 1.0 + 1e-9, axis=1).sum()),
+            "output_crossed": int(np.any(by_output > 1.0 + 1e-9, axis=(1, 2)).sum()),
+            "fallen": int(flights.fallen.sum()),
+            "largest_share": float(np.sqrt(energy.max())),
+            "largest_output_share": float(by_output.max()),
+            "observed_tube": float(np.linalg.norm(error, axis=-1).max()),
+            "certified_radius": tube.steady_radius,
+        }
+    return {"rows": rows}
+
+
+def part_held() -> list[dict[str, Any]]:
+    """Return one row for each policy, bound and way of making disturbances."""
+    rows = []
+    for policy, bound in _HELD:
+        piece = kept(f"held-{policy}-{bound}", partial(held_case, policy, bound))
+        about = {"part": "cartpole-held", "policy": policy, "bound": bound}
+        rows += [{**about, "made": made, **row} for made, row in piece["rows"].items()]
+    return rows
+
+
+def part_ellipsoid() -> list[dict[str, Any]]:
+    """Return one row for each way of making disturbances, added up over the chunks."""
+    tube = ellipsoid_tube()
+    proof = kept(
+        "ellipsoid-proof",
+        lambda: {"proved": prove_tube(CartPoleSettings().system, tube).proved},
+    )
+    chunks = [
+        kept(f"ellipsoid-{chunk}", partial(ellipsoid_chunk, tube, chunk))["rows"]
+        for chunk in range(_ELLIPSOID_SCENARIOS // _CHUNK)
+    ]
+    rows = []
+    for made in chunks[0]:
+        parts = [chunk[made] for chunk in chunks]
+        row = {name: max(part[name] for part in parts) for name in parts[0]}
+        for name in ("flights", "crossed", "output_crossed", "fallen"):
+            row[name] = sum(part[name] for part in parts)
+        about = {"part": "cartpole-ellipsoid", "policy": "TubeControl", "bound": _ELLIPSOID_BOUND}
+        rows.append({**about, "made": made, **row, "tube_proved": proof["proved"]})
+    return rows
+
+
+def part_spacecraft() -> list[dict[str, Any]]:
+    """Return one row for each bound and way of making disturbances."""
+    rows = []
+    for bound in SPACECRAFT_BOUNDS:
+        piece = kept(f"spacecraft-{bound}", partial(spacecraft_case, bound))
+        about = {"part": "spacecraft", "policy": "centralized (u*)", "bound": bound}
+        rows += [{**about, "made": made, **row} for made, row in piece["rows"].items()]
+    return rows
+
+
+PARTS: dict[str, Callable[[], list[dict[str, Any]]]] = {
+    "held": part_held,
+    "ellipsoid": part_ellipsoid,
+    "spacecraft": part_spacecraft,
+}
+
+
+def show(rows: list[dict[str, Any]]) -> None:
+    """Print the table."""
+    table = Table(title="certified bounds against random, greedy and searched disturbances")
+    for heading in (
+        "part",
+        "policy",
+        "d̄",
+        "made",
+        "flights",
+        "crossed",
+        "share",
+        "observed",
+        "bound",
+    ):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        table.add_row(
+            row["part"],
+            row["policy"],
+            f"{row['bound']:g}",
+            row["made"],
+            str(row["flights"]),
+            str(row["crossed"]),
+            f"{100 * row['largest_share']:.1f} %",
+            f"{row['observed_tube']:.3g}",
+            f"{row['certified_radius']:.3g}",
+        )
+    Console(width=120).print(table)
+
+
+def main() -> None:
+    """Run the study from the command line."""
+    parser = argparse.ArgumentParser(description="Try to cross the certified bounds.")
+    parser.add_argument("--part", choices=tuple(PARTS), help="only that part")
+    parser.add_argument("--fresh", action="store_true", help="forget the pieces kept")
+    parser.add_argument(
+        "--json", type=Path, default=Path("benchmarks/results/worst_case_certificates.json")
+    )
+    options = parser.parse_args()
+    if options.fresh:
+        for path in FOLDER.glob("*.json"):
+            path.unlink()
+    rows = [row for name in PARTS if options.part in (None, name) for row in PARTS[name]()]
+    show(rows)
+    total = {
+        part: sum(row["flights"] for row in rows if row["part"] == part)
+        for part in dict.fromkeys(row["part"] for row in rows)
+    }
+    write_json(
+        options.json,
+        {
+            "command": COMMAND + (f" --part {options.part}" if options.part else ""),
+            "flights": total,
+            "crossed": sum(row["crossed"] for row in rows),
+            "rows": rows,
+        },
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""`lagros attack`: what it prints and writes, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from lagros_benchmarks.cli import app
+from lagros_benchmarks.worst_case_replay import load_worst_cases, save_worst_cases
+
+RUNNER = CliRunner()
+
+
+def test_attack_writes_its_figures_and_flies_them_again(tmp_path: Path) -> None:
+    figures, sequences = tmp_path / "worst.json", tmp_path / "worst.npz"
+    options = ["--policy", "lqr", "--goal", "clearance", "--bound", "0.3", "--method", "random"]
+    files = ["--json", str(figures), "--npz", str(sequences)]
+    done = RUNNER.invoke(
+        app, ["attack", "cartpole", "--episodes", "2", "--budget", "60", *options, *files]
+    )
+    assert done.exit_code == 0, done.output
+    assert "goal clearance, bound 0.3" in done.output
+    row = json.loads(figures.read_text())
+    assert (row["task"], row["policy"], row["bound"]) == ("cartpole", "lqr", 0.3)
+    assert len(row["outcomes"]) == len(row["random_outcomes"]) == 2
+    assert row["score_worst"] == max(one["score"] for one in row["outcomes"])
+
+    again = RUNNER.invoke(app, ["attack", "cartpole", "--replay", str(sequences)])
+    assert again.exit_code == 0, again.output
+    assert again.output.count("as stored") == 2
+
+    # A figure that the sequence does not give is found out.
+    cases = load_worst_cases(sequences)
+    first = replace(cases.outcomes[0], score=cases.outcomes[0].score + 1e-12)
+    save_worst_cases(replace(cases, outcomes=(first, *cases.outcomes[1:])), sequences)
+    wrong = RUNNER.invoke(app, ["attack", "cartpole", "--replay", str(sequences)])
+    assert wrong.exit_code == 1
+    assert "1 of 2 differ" in wrong.output
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["boat"], "unknown task 'boat'"),
+        (["cartpole", "--goal", "speed"], "goal='speed'"),
+        (["cartpole", "--method", "annealing"], "method='annealing'"),
+        (["cartpole", "--bound", "-1"], "bound=-1.0"),
+        (["cartpole", "--safety-filter"], "for the task spacecraft"),
+        (["spacecraft", "--policy", "lqr"], "unknown policy 'lqr'"),
+        (["cartpole", "--replay", "nowhere.npz"], "nowhere.npz"),
+    ],
+)
+def test_attack_says_what_is_wrong(options: list[str], message: str) -> None:
+    done = RUNNER.invoke(app, ["attack", *options])
+    assert done.exit_code == 2
+    assert message in done.output
+    assert "Traceback" not in done.output
