@@ -1,0 +1,141 @@
+"""The sliding-variable law against the equation of motion, random and worst disturbances."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lagros_envs.dynamics import Spacecraft, hold_step
+from lagros_policies.contraction.lagrangian import (
+    SlidingAxis,
+    SlidingTracking,
+    hierarchical_bound,
+    peak_position_error,
+    steady_position_bound,
+)
+
+BODY, PERIOD = Spacecraft(), 0.1
+RATES = st.floats(0.2, 8.0)
+
+
+def law(position_rate=2.0, sliding_rate=2.0):
+    axis = SlidingAxis(position_rate, sliding_rate, PERIOD)
+    return SlidingTracking(BODY, axis, axis)
+
+
+def fly(tracking, start, pushes, nominal=None, accelerations=None):
+    """Track with the package's physics; return states (steps + 1, agents, 6) and mean effort."""
+    states, effort = [start], 0.0
+    for step, push in enumerate(pushes):
+        target = np.zeros(6) if nominal is None else nominal[step]
+        wanted = np.zeros(3) if accelerations is None else accelerations[step]
+        thrust = tracking.control(states[-1], target, wanted)
+        assert np.all(thrust >= 0.0)
+        effort += PERIOD * np.mean(np.sum(thrust**2, axis=-1))
+        states.append(hold_step(BODY, states[-1], thrust, PERIOD, push, substeps=2))
+    return np.array(states), effort
+
+
+@given(RATES, RATES, st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
+@settings(max_examples=50, deadline=None)
+def test_the_sliding_variable_shrinks_exactly_under_the_hold(rate, sliding_rate, error, speed):
+    axis = SlidingAxis(rate, sliding_rate, PERIOD)
+    # No turning: the plane alone, along x, by the package's own integrator.
+    state = np.array([error, 0.0, 0.0, speed, 0.0, 0.0])
+    (_, after), _ = fly(law(rate, sliding_rate), state, [np.zeros(6)])
+    before_s = speed + rate * error
+    after_s = after[3] + rate * after[0]
+    assert after_s == pytest.approx(np.exp(-sliding_rate * PERIOD) * before_s, abs=1e-9)
+    wanted = axis.position_factor * error + axis.coupling * before_s
+    assert after[0] == pytest.approx(wanted, abs=1e-9)
+
+
+def test_without_hold_it_is_the_law_of_the_textbook():
+    axis = SlidingAxis(1.7, 0.6, 1e-7)
+    error, speed = np.array([0.3, -1.0]), np.array([0.2, 0.9])
+    textbook = -1.7 * speed - 0.6 * (speed + 1.7 * error)
+    assert axis.deviation(error, speed) == pytest.approx(textbook, abs=1e-5)
+
+
+def test_any_smooth_trajectory_is_reached_from_any_start():
+    rng = np.random.default_rng(0)
+    accelerations = np.repeat(rng.uniform(-0.3, 0.3, (120, 1, 3)), 5, axis=1)
+    accelerations[..., 2] = 0.0
+    # A nominal that the held dynamics can follow exactly: on it the law adds nothing.
+    nominal = [np.zeros((5, 6))]
+    for wanted in accelerations:
+        force = law().control(nominal[-1], nominal[-1], wanted)
+        nominal.append(hold_step(BODY, nominal[-1], force, PERIOD, substeps=2))
+    start = rng.uniform(-1.0, 1.0, (5, 6))
+    reached, _ = fly(law(), start, np.zeros((120, 1, 6)), nominal, accelerations)
+    assert np.abs(reached[0] - nominal[0]).max() > 0.5
+    assert np.abs(reached[-1] - nominal[-1]).max() < 1e-4
+
+
+@given(RATES, RATES, st.integers(0, 2**31))
+@settings(max_examples=8, deadline=None)
+def test_no_disturbance_crosses_the_bounds(rate, sliding_rate, seed):
+    tracking, bound, steps = law(rate, sliding_rate), 0.4, 120
+    axis = tracking.plane
+    rng = np.random.default_rng(seed)
+    # Held in one direction, switching at random, and random at every step; all of full length.
+    pushes = rng.standard_normal((3, steps, 6, 6))
+    pushes[..., [2, 5]] = 0.0
+    pushes[0] = pushes[0, :1]
+    pushes[1] = np.repeat(pushes[1, ::20], 20, axis=0)
+    pushes *= bound / np.linalg.norm(pushes, axis=-1, keepdims=True)
+    pushes = np.concatenate(list(pushes), axis=1)
+    states, _ = fly(tracking, np.zeros((18, 6)), pushes)
+    limits = hierarchical_bound(axis, bound, steps)
+    position = np.linalg.norm(states[..., :2], axis=-1).max(axis=1)
+    velocity = np.linalg.norm(states[..., 3:5], axis=-1).max(axis=1)
+    assert np.all(position <= limits.position + 1e-9)
+    assert np.all(velocity <= limits.velocity + 1e-9)
+    assert np.all(np.hypot(position, velocity) <= np.sqrt(2) * limits.state + 1e-9)
+    assert position.max() <= peak_position_error(axis, bound) + 1e-9
+    assert limits.position[-1] <= steady_position_bound(axis, bound)
+
+
+def test_the_peak_is_reached_by_the_disturbance_that_it_names():
+    tracking, bound, steps = law(3.0, 1.6), 0.3, 120
+    axis = tracking.plane
+    # Brute force: the position at the end is linear in every push, so probe each of them alone.
+    probes = np.zeros((steps, 2, steps, 6))
+    for step in range(steps):
+        probes[step, 0, step, 0] = probes[step, 1, step, 3] = 1.0
+    states, _ = fly(tracking, np.zeros((2 * steps, 6)), probes.reshape(steps, 2 * steps, 6))
+    effects = states[-1, :, 0].reshape(2, steps).T
+    worst = np.zeros((steps, 6))
+    lengths = np.maximum(np.linalg.norm(effects, axis=1), 1e-300)
+    worst[:, 0], worst[:, 3] = bound * effects[:, 0] / lengths, bound * effects[:, 1] / lengths
+    states, _ = fly(tracking, np.zeros(6), worst)
+    peak = peak_position_error(axis, bound)
+    assert states[-1, 0] == pytest.approx(peak, rel=1e-6)
+    assert peak < hierarchical_bound(axis, bound, 600).position[-1]
+
+
+def test_bound_from_an_initial_error_holds_without_disturbance():
+    axis = SlidingAxis(2.0, 1.0, PERIOD)
+    start = np.array([0.4, 0.0, 0.0, -0.2, 0.0, 0.0])
+    states, _ = fly(law(2.0, 1.0), start, np.zeros((60, 6)))
+    limits = hierarchical_bound(axis, 0.0, 60, abs(-0.2 + 2.0 * 0.4), 0.4)
+    assert np.all(np.abs(states[:, 0]) <= limits.position + 1e-12)
+    assert limits.position[-1] < 0.01
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: SlidingAxis(0.0, 1.0, 0.1), "position_rate"),
+        (lambda: SlidingAxis(1.0, float("nan"), 0.1), "sliding_rate"),
+        (lambda: SlidingAxis(20.0, 1.0, 0.1), "below 2"),
+        (
+            lambda: SlidingTracking(BODY, SlidingAxis(period=0.1), SlidingAxis(period=0.2)),
+            "one period",
+        ),
+        (lambda: hierarchical_bound(SlidingAxis(), -1.0, 3), "disturbance_bound"),
+    ],
+)
+def test_wrong_values_are_named(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
