@@ -25,7 +25,10 @@ _CARTPOLE = {
     "lagros": "lagros_policies.lagros:LagrosPolicy",
     "lqr": "lagros_policies.baselines:LqrPolicy",
     "random": "lagros_policies.baselines:RandomPolicy",
-    "ppo": "lagros_policies.baselines:PpoPolicy",
+    "ppo": "lagros_policies.actor:PpoPolicy",
+    "sac": "lagros_policies.actor:SacPolicy",
+    "td3": "lagros_policies.actor:Td3Policy",
+    "residual": "lagros_policies.residual:ResidualPolicy",
 }
 _SPACECRAFT = {
     "learned": "lagros_policies.learned:SpacecraftLearnedPolicy",
@@ -98,7 +101,7 @@ def make(name: str, env: Any, **settings: Any) -> Policy:
     if name in classes:
         return _class_named(classes[name])(task, **settings)
     if name.endswith(".zip"):
-        from lagros_policies.baselines import load_stable_baselines3
+        from lagros_policies.sb3_model import load_stable_baselines3
 
         algorithm, _, path = name.rpartition(":")
         return load_stable_baselines3(path, algorithm or None, **settings)

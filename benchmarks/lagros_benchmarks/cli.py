@@ -15,8 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
 
+from lagros_benchmarks.attack import attack
+from lagros_benchmarks.certify import certify
 from lagros_benchmarks.data import data
 from lagros_benchmarks.export import export
+from lagros_benchmarks.train import train
 from lagros_benchmarks.watch import watch
 
 if TYPE_CHECKING:
@@ -42,6 +45,12 @@ Value = TypeVar("Value")
 
 def _file(explanation: str) -> Any:
     return typer.Option(metavar="FILE", dir_okay=False, help=explanation)
+
+
+BACKEND_OPTION = typer.Option(help="Whose processes the workers are: of loky, ray or dask.")
+ADDRESS_OPTION = typer.Option(
+    help="Of a running cluster of ray or dask, which is used with the workers that it has."
+)
 
 
 def fail(error: Exception | str, status: int = USAGE_ERROR) -> NoReturn:
@@ -91,8 +100,9 @@ def bench(
         str | None,
         typer.Option(
             metavar="NAME[,NAME]",
-            help="cartpole: of learned, tube-mpc, lagros, lqr, random, ppo. spacecraft: of "
-            "learned, tube-mpc, lagros, centralized. Or a stable-baselines3 .zip, or module:Class.",
+            help="cartpole: of learned, tube-mpc, lagros, lqr, random, ppo, sac, td3, residual. "
+            "spacecraft: of learned, tube-mpc, lagros, centralized. Or a stable-baselines3 .zip, "
+            "or module:Class.",
         ),
     ] = None,
     episodes: Annotated[
@@ -130,6 +140,8 @@ def bench(
     jobs: Annotated[
         int, typer.Option(help="Worker processes; Δt is then measured in a serial pass after.")
     ] = 1,
+    backend: Annotated[str, BACKEND_OPTION] = "loky",
+    address: Annotated[str | None, ADDRESS_OPTION] = None,
     timing_episodes: Annotated[
         int, typer.Option(help="Episodes of that pass, which spacecraft always have.")
     ] = 10,
@@ -158,6 +170,7 @@ def bench(
     """Compare policies on the same episodes; print the table, write what is asked for."""
     from lagros_benchmarks.report import Outputs
     from lagros_benchmarks.settings import BenchmarkSettings, check_policy, check_task
+    from lagros_policies.backends import Backend
 
     outputs = Outputs(json, csv, latex, markdown, figure, episodes_file, scene, scene_world)
     # A policy of the user's own, module:Class, lies in the folder that lagros is run from.
@@ -182,6 +195,7 @@ def bench(
             safety_filter=safety_filter,
             jobs=jobs,
             timing_episodes=timing_episodes,
+            backend=Backend(backend, address),
         )
         for name in settings.policies:
             check_policy(name, task)
@@ -213,6 +227,8 @@ def reproduce(
         ),
     ] = None,
     jobs: Annotated[int, typer.Option(help="Worker processes; they change no result.")] = 2,
+    backend: Annotated[str, BACKEND_OPTION] = "loky",
+    address: Annotated[str | None, ADDRESS_OPTION] = None,
     episodes: Annotated[
         int | None,
         typer.Option(help="Episodes (worlds) of each policy in the table; 50, spacecraft 20."),
@@ -223,15 +239,17 @@ def reproduce(
 ) -> None:
     """From nothing to the table and figures: metric or expert, data, training, benchmark."""
     from lagros_benchmarks.settings import check_task
+    from lagros_policies.backends import Backend, BackendError, running
 
     place = folder or Path(f"runs/reproduce-{task}")
     try:
         check_task(task)
-        with progress_bar() as progress:
+        workers = Backend(backend, address)
+        with progress_bar() as progress, running(workers, jobs):
             if task == "cartpole":
                 from lagros_benchmarks.reproduce import ReproduceSettings, reproduce_cartpole
 
-                made = ReproduceSettings(jobs=jobs, episodes=episodes or 50)
+                made = ReproduceSettings(jobs=jobs, episodes=episodes or 50, backend=workers)
                 benchmark = (
                     made.shipped_benchmark
                     if shipped
@@ -240,7 +258,9 @@ def reproduce(
             else:
                 from lagros_benchmarks import reproduce_spacecraft as spacecraft
 
-                wanted = spacecraft.SpacecraftReproduceSettings(jobs=jobs, worlds=episodes or 20)
+                wanted = spacecraft.SpacecraftReproduceSettings(
+                    jobs=jobs, worlds=episodes or 20, backend=workers
+                )
                 benchmark = (
                     wanted.benchmark(None)
                     if shipped
@@ -248,6 +268,8 @@ def reproduce(
                 )
     except ValueError as error:
         fail(error)
+    except BackendError as error:
+        fail(error, status=1)
     run_and_report(benchmark, _reproduced(task, place))
 
 
@@ -264,6 +286,9 @@ def _reproduced(task: str, folder: Path) -> Outputs:
 
 app.command()(watch)
 app.command()(export)
+app.command()(certify)
+app.command()(train)
+app.command()(attack)
 app.add_typer(data, name="data")
 
 
@@ -286,12 +311,13 @@ def run_and_report(settings: BenchmarkSettings, outputs: Outputs) -> list[Row]:
     from lagros_benchmarks.records import summarise
     from lagros_benchmarks.report import print_report
     from lagros_benchmarks.runner import run_benchmark
+    from lagros_policies.backends import BackendError
 
     try:
         with progress_bar() as progress:
             run = run_benchmark(settings, progress=progress)
-    except SetupError as error:
-        # No weights, damaged weights, an extra that is not installed.
+    except (SetupError, BackendError) as error:
+        # No weights, damaged weights, an extra that is not installed, a cluster that is not there.
         fail(error, status=1)
     rows = summarise(run)
     print_report(rows)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +9,11 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 
-from lagros_benchmarks import train_spacecraft_ppo as training
-from lagros_benchmarks.ppo_run import actor_network
+from lagros_benchmarks import train_spacecraft as training
 from lagros_benchmarks.sb3_vector import SB3VectorEnv
-from lagros_benchmarks.spacecraft_ppo import FEATURES, SpacecraftPpoPolicy, body_features
+from lagros_benchmarks.train_agent import actor_network, make_agent
+from lagros_benchmarks.train_run import Place, train
+from lagros_benchmarks.train_settings import Ppo, SpacecraftTraining
 from lagros_envs import spacecraft_v0
 from lagros_envs.observation import Layout
 from lagros_envs.scenarios import PRESETS, Scenario
@@ -21,15 +21,14 @@ from lagros_envs.seeding import episode_seeds
 from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
 from lagros_policies.imitation.networks import Mlp
+from lagros_policies.spacecraft_ppo import FEATURES, SpacecraftPpoPolicy, body_features
 
-TINY = training.SpacecraftPpoTraining(
+TINY = SpacecraftTraining(
+    Ppo(rollout_steps=30, batch_size=60, epochs=2),
     segments=2,
-    rollouts=1,
-    rollout_steps=30,
+    segment_steps=30,
     worlds=2,
     agents=2,
-    batch_size=60,
-    epochs=2,
     time_limit=2.0,
     curve_episodes=2,
     final_episodes=2,
@@ -129,8 +128,7 @@ def test_nearness_costs_what_the_distances_say():
         )
         for _ in range(2)
     ]
-    run = replace(TINY, nearness_weight=3.0, nearness_range=0.4)
-    plain, venv = envs[0], training.KeepDistance(envs[1], envs[1].venv.layout, 0.5, run, 0.1)
+    plain, venv = envs[0], training.KeepDistance(envs[1], envs[1].venv.layout, 0.5, 3.0, 0.4, 0.1)
     for env in (plain, venv):
         env.seed(4)
         env.reset()
@@ -167,11 +165,11 @@ def test_nearness_costs_what_the_distances_say():
 def test_both_routes_train_the_same_agent():
     weights = []
     for parallel_env in (False, True):
-        model, normalised = training.build(TINY, parallel_env)
-        model.set_env(normalised, force_reset=True)
+        lesson = training.SpacecraftLesson(TINY, parallel_env)
+        model = make_agent(TINY, lesson.venv)
         model.set_random_seed(3)
-        model.learn(TINY.segment_steps)
-        assert model.num_timesteps == TINY.segment_steps == 120
+        model.learn(TINY.steps_of_segment)
+        assert model.num_timesteps == TINY.steps_of_segment == 120
         weights.append(actor_network(model).weights)
     for ours, theirs in zip(*weights, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
@@ -180,7 +178,7 @@ def test_both_routes_train_the_same_agent():
 def test_an_interrupted_training_ends_with_the_same_weights(tmp_path, monkeypatch):
     calls = []
 
-    def quick(policy, agents, seeds, *condition):
+    def quick(policy, preset, agents, seeds, *condition):
         """Figures that tell one network from another."""
         share = np.resize(policy.network.biases[-1], agents * len(seeds))
         rates = dict.fromkeys(training.RATES, share > 0.0)
@@ -192,16 +190,17 @@ def test_an_interrupted_training_ends_with_the_same_weights(tmp_path, monkeypatc
             raise KeyboardInterrupt
         return quick(*arguments)
 
-    monkeypatch.setattr(training, "evaluate", quick)
-    whole = training.train(TINY, tmp_path / "whole.safetensors", tmp_path / "whole.pt")
+    def run(folder):
+        return train(TINY, Place(folder), lambda: training.SpacecraftLesson(TINY))
 
+    monkeypatch.setattr(training, "evaluate", quick)
+    whole = run(tmp_path / "whole")
     monkeypatch.setattr(training, "evaluate", killed)
-    out, checkpoint = tmp_path / "cut.safetensors", tmp_path / "cut.pt"
     with pytest.raises(KeyboardInterrupt):
-        training.train(TINY, out, checkpoint)
-    assert not out.exists()
-    cut = training.train(TINY, out, checkpoint)
-    assert out.read_bytes() == (tmp_path / "whole.safetensors").read_bytes()
+        run(tmp_path / "cut")
+    cut = run(tmp_path / "cut")
+    weights = [tmp_path / name / "weights.safetensors" for name in ("cut", "whole")]
+    assert weights[0].read_bytes() == weights[1].read_bytes()
     for name in ("success", "steps", "effort_to_success"):
         assert cut["curve"][name] == whole["curve"][name]
     assert cut["final"] == whole["final"]
@@ -209,15 +208,14 @@ def test_an_interrupted_training_ends_with_the_same_weights(tmp_path, monkeypatc
         (1, 0.2, 2),
         (3, 0.2, 2),
     ]
-    json.dumps(cut, allow_nan=False)
-    with pytest.raises(ValueError, match="belongs to another run"):
-        training.train(replace(TINY, agents=3, batch_size=90), out, checkpoint)
+    assert cut["training"]["preset"] == "open"
 
 
 def test_the_evaluation_counts_agents_as_the_environment_does():
-    policy = SpacecraftPpoPolicy(weights=Mlp([np.zeros((FEATURES, 8))], [np.full(8, -1.0)]))
+    network = Mlp([np.zeros((FEATURES, 8))], [np.full(8, -1.0)])
+    policy = SpacecraftPpoPolicy(num_agents=2, weights=network)
     seeds = episode_seeds(5, 3)
-    measures = training.evaluate(policy, 2, seeds, "uniform", 0.4)
+    measures = training.evaluate(policy, "open", 2, seeds, "uniform", 0.4)
     expected = []
     for seed in seeds:
         env = spacecraft_v0.parallel_env(2, "open", disturbance="uniform", disturbance_bound=0.4)
@@ -227,26 +225,18 @@ def test_the_evaluation_counts_agents_as_the_environment_does():
         expected += [infos[agent] for agent in env.possible_agents]
     for name, values in measures.items():
         np.testing.assert_allclose(values, [info[name] for info in expected], atol=1e-9)
-    figures = training.figures(measures)
+    figures = training.summary(measures)
     assert figures["effort_to_success"] == 0.0
     assert figures["collided"] == np.mean([info["collided"] for info in expected])
     never = {**measures, "success_time": np.full(6, np.inf)}
-    assert training.figures(never)["success_time"] == 0.0
-
-
-@pytest.mark.parametrize("arguments", [["--seed", "-1"], ["--segments", "0"]])
-def test_arguments_that_make_no_sense_are_refused(arguments, capsys):
-    with pytest.raises(SystemExit):
-        training.main(arguments)
-    assert "must be >=" in capsys.readouterr().err
+    assert training.summary(never)["success_time"] == 0.0
 
 
 @pytest.mark.slow
 def test_it_learns_to_reach_goals(tmp_path):
-    run = replace(
-        training.SpacecraftPpoTraining(), segments=3, final_agents=(3,), final_bounds=(0.2,)
-    )
-    reached = training.train(run, tmp_path / "a.safetensors", tmp_path / "a.pt")["final"][0]
+    run = SpacecraftTraining(segments=3, final_agents=(3,), final_bounds=(0.2,))
+    record = train(run, Place(tmp_path), lambda: training.SpacecraftLesson(run))
+    reached = record["final"][0]
     assert reached["success"] > 0.8
     assert reached["collided"] < 0.1
 
@@ -255,7 +245,7 @@ def test_it_learns_to_reach_goals(tmp_path):
 
 
 def test_the_actor_is_the_model(tmp_path):
-    model, _ = training.build(TINY)
+    model = make_agent(TINY, training.SpacecraftLesson(TINY).venv)
     path = tmp_path / "a.safetensors"
     actor_network(model).save(path)
     env = SpacecraftVectorEnv(8, 4, "paper", disturbance="uniform")

@@ -18,8 +18,8 @@ from lagros_policies.sensed import Sensed
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
-# Where the training writes its actor.
-ACTOR = Path("runs") / "ppo" / "spacecraft-open.safetensors"
+# Where the training writes its actor; none is shipped.
+WEIGHTS = Path("runs/train/spacecraft-ppo/seed-0/weights.safetensors")
 NEAREST = 3  # neighbours that the agent looks at
 _OWN, _EACH = 6, 7
 FEATURES = _OWN + _EACH * NEAREST
@@ -86,14 +86,14 @@ def body_features(layout: Layout, observation: NDArray[np.floating]) -> Float32A
 class SpacecraftPpoPolicy:
     """The trained actor, its mean action, for any number of agents.
 
-    `python -m lagros_benchmarks.train_spacecraft_ppo` trains it, in the preset `open`: it does not
-    see obstacles.
+    `lagros train spacecraft --algo ppo` trains it, in the preset `open`: it does not see obstacles.
 
     Args:
         settings: The task; None for the paper's.
         preset: The preset, or its name, of the environment.
         num_agents: Number of agents; None for the preset's own.
-        weights: The file of the training, or the network itself.
+        weights: The file of a training, or the network itself; None for that of seed 0 in the
+            folder `runs/train` here.
 
     Raises:
         FileNotFoundError: There is no such file: train first.
@@ -108,15 +108,17 @@ class SpacecraftPpoPolicy:
         settings: task.SpacecraftSettings | None = None,
         preset: str | Preset = "open",
         num_agents: int | None = None,
-        weights: Path | str | Mlp = ACTOR,
+        weights: Path | str | Mlp | None = None,
     ) -> None:
         """Load the actor."""
         self.settings = settings or task.SpacecraftSettings()
         self.layout = Layout.for_preset(preset_named(preset).for_agents(num_agents), self.settings)
-        self.network = weights if isinstance(weights, Mlp) else Mlp.load(weights)
+        if not isinstance(weights, Mlp):
+            weights = Mlp.load(WEIGHTS if weights is None else weights)
+        self.network = weights
         if (self.network.inputs, self.network.outputs) != (FEATURES, task.THRUSTERS):
             raise ValueError(
-                f"{weights} maps {self.network.inputs} numbers to {self.network.outputs}; this "
+                f"the network maps {self.network.inputs} numbers to {self.network.outputs}; this "
                 f"agent maps {FEATURES} to {task.THRUSTERS}"
             )
 

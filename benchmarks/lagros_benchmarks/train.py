@@ -1,0 +1,164 @@
+"""`lagros train`: reinforcement learning of our tasks with stable-baselines3.
+
+Only the standard library and typer are imported here; the command imports the rest.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from lagros_benchmarks.train_settings import Training
+
+RUNS = Path("runs/train")
+
+
+def train(
+    task: Annotated[str, typer.Argument(help="cartpole, or spacecraft (preset open).")],
+    algo: Annotated[
+        str,
+        typer.Option(metavar="NAME[,NAME]", help="cartpole: of ppo, sac, td3. spacecraft: ppo."),
+    ] = "ppo",
+    seed: Annotated[
+        str,
+        typer.Option(metavar="N[,N]", help="Seeds; their episodes never occur in evaluation."),
+    ] = "0",
+    out: Annotated[
+        Path,
+        typer.Option(file_okay=False, help="Folder of the runs, TASK-ALGO/seed-N each."),
+    ] = RUNS,
+    segments: Annotated[
+        int | None,
+        typer.Option(help="Length of a run; each segment ends with a checkpoint."),
+    ] = None,
+    residual: Annotated[
+        float | None,
+        typer.Option(
+            metavar="NEWTONS",
+            help="cartpole: learn a correction of LAG-ROS of at most so much, 4 for instance.",
+        ),
+    ] = None,
+    parallel_env: Annotated[
+        bool,
+        typer.Option(
+            "--parallel-env",
+            help="spacecraft: rows from PettingZoo's environment; the same episodes, slower.",
+        ),
+    ] = False,
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Write events for TensorBoard beside each run.")
+    ] = False,
+    json: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", dir_okay=False, help="The learning curves of all runs."),
+    ] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", dir_okay=False, help="The same, drawn."),
+    ] = None,
+) -> None:
+    """Train agents, one after the other; go on where a run was killed, skip what is complete."""
+    from lagros_benchmarks.cli import fail, listed
+    from lagros_benchmarks.train_settings import default_training
+
+    try:
+        names = listed(algo, str, "--algo")
+        seeds = listed(seed, int, "--seed")
+        if not names or not seeds:
+            raise ValueError("--algo and --seed must not be empty")
+        if parallel_env and task != "spacecraft":
+            raise ValueError(f"--parallel-env is for spacecraft; leave it out for {task}")
+        if residual is not None and task != "cartpole":
+            raise ValueError(f"--residual is for cartpole; leave it out for {task}")
+        changes: dict[str, Any] = {} if segments is None else {"segments": segments}
+        if residual is not None:
+            changes["largest_correction"] = residual
+        runs = [
+            replace(default_training(task, name), seed=number, **changes)
+            for number in seeds
+            for name in names
+        ]
+        if figure is not None:
+            from lagros_benchmarks.canvas import check_figure_path
+
+            check_figure_path(figure)
+    except ValueError as error:
+        fail(error)
+    _say_what_happens()
+    try:
+        records = [
+            _train_one(run, out, segments, residual, tensorboard, parallel_env) for run in runs
+        ]
+        written = _write_curves(records, json, figure)
+    except (ImportError, ValueError, OSError) as error:
+        # An extra that is not installed, a folder of another run, a full disk.
+        fail(error, status=1)
+    for path in written:
+        typer.echo(f"wrote {path}")
+
+
+def folder_of(run: Training, out: Path) -> Path:
+    """Return the folder of a run."""
+    return out / f"{run.task}-{run.label}" / f"seed-{run.seed}"
+
+
+def _say_what_happens() -> None:
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(message)s")
+
+
+def _train_one(
+    run: Training,
+    out: Path,
+    segments: int | None,
+    residual: float | None,
+    tensorboard: bool,
+    parallel_env: bool,
+) -> dict[str, Any]:
+    try:
+        import stable_baselines3  # noqa: F401
+    except ImportError as error:
+        raise ImportError(
+            "lagros train needs stable-baselines3: pip install 'lagros[rl,policies]'"
+        ) from error
+    import torch
+
+    from lagros_benchmarks.train_lessons import lesson_of
+    from lagros_benchmarks.train_run import Place
+    from lagros_benchmarks.train_run import train as train_run
+
+    # One thread: networks this small gain nothing from more, and the sums stay reproducible.
+    torch.set_num_threads(1)
+    place = Place(folder_of(run, out), tensorboard)
+    command = f"lagros train {run.task} --algo {run.algorithm.name} --seed {run.seed}"
+    command += "" if segments is None else f" --segments {segments}"
+    command += "" if residual is None else f" --residual {residual:g}"
+    record = train_run(run, place, lambda: lesson_of(run, parallel_env), command)
+    typer.echo(f"{place.weights}")
+    for row in record["final"]:
+        typer.echo("  " + "  ".join(f"{name} {value}" for name, value in row.items()))
+    return record
+
+
+def _write_curves(
+    records: Sequence[dict[str, Any]], json: Path | None, figure: Path | None
+) -> list[Path]:
+    written: list[Path] = []
+    if json is None and figure is None:
+        return written
+    from lagros_benchmarks.files import write_json
+    from lagros_benchmarks.surroundings import own_command
+    from lagros_benchmarks.train_curves import curves_of, draw
+
+    curves = curves_of(records, " ".join(own_command()))
+    if json is not None:
+        written.append(write_json(json, curves))
+    if figure is not None:
+        written.append(draw(curves, figure))
+    return written

@@ -1,0 +1,323 @@
+"""What a training run depends on: the algorithm, the task, and how long.
+
+The defaults are the hyperparameters that were found (docs/baselines.md); a run writes its own
+beside its weights.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, ClassVar
+
+from lagros_envs.seeding import EVALUATION
+
+# Segments are namespaces of their own in `lagros_envs.seeding`'s sense, far below `EVALUATION`.
+MOST_SEGMENTS = 1 << 16
+# Namespaces of the held-out episodes of a learning curve and of those at its end ("curv" and "last"
+# in ASCII): neither training nor `lagros bench` ever meets them.
+CURVE, FINAL = 0x63757276, 0x6C617374
+assert min(EVALUATION, CURVE, FINAL) >= MOST_SEGMENTS
+
+
+def _check_numbers(settings: Any, positive: tuple[str, ...], counts: tuple[str, ...]) -> None:
+    for name in positive:
+        value = getattr(settings, name)
+        if not (math.isfinite(value) and value > 0.0):
+            raise ValueError(f"{name}={value!r} must be finite and > 0")
+    for name in counts:
+        value = getattr(settings, name)
+        if value != int(value) or value < 1:
+            raise ValueError(f"{name}={value!r} must be a whole number >= 1")
+
+
+@dataclass(frozen=True)
+class Ppo:
+    """Proximal policy optimisation.
+
+    Attributes:
+        rollout_steps: Control steps in every world between two updates.
+        batch_size: Samples of one gradient step.
+        epochs: Passes over a rollout.
+        learning_rate: At the start; it falls linearly, by segments, to a tenth.
+        discount: gamma per control step.
+        gae_decay: lambda of the generalised advantage estimate.
+        clip_range: Clip of the probability ratio.
+        initial_log_std: Logarithm of the spread of the first actions. -2 is 5.4 N on the cart-pole,
+            where the usual 0 explores with 40 N, which makes every action costly and the pole fall
+            at once; and 0.14 N of each thruster of a spacecraft.
+        hidden: Widths of the hidden tanh layers, of actor and critic each.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    name: ClassVar[str] = "ppo"
+    rollout_steps: int = 90
+    batch_size: int = 1440
+    epochs: int = 10
+    learning_rate: float = 3e-4
+    discount: float = 0.99
+    gae_decay: float = 0.95
+    clip_range: float = 0.2
+    initial_log_std: float = -2.0
+    hidden: tuple[int, ...] = (64, 64)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        _check_numbers(
+            self,
+            ("learning_rate", "discount", "clip_range"),
+            ("rollout_steps", "batch_size", "epochs"),
+        )
+
+
+@dataclass(frozen=True)
+class OffPolicy:
+    """What soft actor-critic and TD3 share: learning from a buffer of all that was met.
+
+    Attributes:
+        batch_size: Samples of one gradient step.
+        gradient_steps: Gradient steps after each control step of all worlds.
+        warm_up: Control steps, over all worlds, of uniform random actions before the first of them.
+        buffer_size: Control steps that are kept.
+        learning_rate: At the start; it falls linearly, by segments, to a tenth.
+        discount: gamma per control step.
+        averaging: tau, the share of the new weights in the target networks.
+        hidden: Widths of the hidden tanh layers, of actor and critics each.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    name: ClassVar[str] = ""
+    batch_size: int = 256
+    gradient_steps: int = 2
+    warm_up: int = 128
+    buffer_size: int = 400_000
+    learning_rate: float = 2e-3
+    discount: float = 0.98
+    averaging: float = 0.01
+    hidden: tuple[int, ...] = (64, 64)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        _check_numbers(
+            self,
+            ("learning_rate", "discount", "averaging"),
+            ("batch_size", "gradient_steps", "buffer_size"),
+        )
+
+
+@dataclass(frozen=True)
+class Sac(OffPolicy):
+    """Soft actor-critic; attributes as in `OffPolicy`, and this.
+
+    Attributes:
+        initial_entropy_weight: The weight of the entropy before it is tuned.
+    """
+
+    name: ClassVar[str] = "sac"
+    initial_entropy_weight: float = 0.1
+
+
+@dataclass(frozen=True)
+class Td3(OffPolicy):
+    """Twin delayed deep deterministic policy gradients; attributes as in `OffPolicy`, and these.
+
+    Attributes:
+        action_noise: Standard deviation of the exploration, in units of the action.
+        policy_delay: Updates of the critics for each of the actor.
+    """
+
+    name: ClassVar[str] = "td3"
+    action_noise: float = 0.1
+    policy_delay: int = 2
+
+
+Algorithm = Ppo | Sac | Td3
+
+
+@dataclass(frozen=True)
+class Training:
+    """A training run, besides the task's physics.
+
+    Attributes:
+        algorithm: What learns, with its hyperparameters.
+        seed: Seed of the run.
+        segments: Number of segments, each followed by an evaluation and a checkpoint.
+        segment_steps: Control steps of every world in a segment.
+        worlds: Worlds side by side.
+        effort_weight: Replaces that of the task's reward in training.
+        disturbance: Kind of disturbance in training.
+        disturbance_bound: Its bound d_bar, in units of the state per second.
+        curve_episodes: Held-out episodes (worlds) after every segment.
+        final_episodes: Others at the end.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    task: ClassVar[str] = ""
+    algorithm: Algorithm = field(default_factory=Ppo)
+    seed: int = 0
+    segments: int = 20
+    segment_steps: int = 270
+    worlds: int = 64
+    effort_weight: float = 0.1
+    disturbance: str = "uniform"
+    disturbance_bound: float = 0.75
+    curve_episodes: int = 200
+    final_episodes: int = 1000
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        _check_numbers(
+            self, (), ("segments", "segment_steps", "worlds", "curve_episodes", "final_episodes")
+        )
+        if self.seed < 0:
+            raise ValueError(f"seed={self.seed!r} must be a non-negative integer")
+        if self.segments >= MOST_SEGMENTS:
+            raise ValueError(
+                f"segments={self.segments} must be below {MOST_SEGMENTS}; make segment_steps larger"
+            )
+        algorithm = self.algorithm
+        if isinstance(algorithm, Ppo) and self.segment_steps % algorithm.rollout_steps:
+            raise ValueError(
+                f"segment_steps={self.segment_steps} must be a multiple of "
+                f"rollout_steps={algorithm.rollout_steps}"
+            )
+
+    @property
+    def label(self) -> str:
+        """Name of the runs that differ in the seed alone."""
+        return self.algorithm.name
+
+    @property
+    def rows(self) -> int:
+        """Agents that learn side by side."""
+        return self.worlds
+
+    @property
+    def steps_of_segment(self) -> int:
+        """Control steps of a segment, over all agents of all worlds."""
+        return self.segment_steps * self.rows
+
+    def learning_rate(self, segment: int) -> float:
+        """Return the learning rate of a segment."""
+        return self.algorithm.learning_rate * (1.0 - 0.9 * segment / self.segments)
+
+    def record(self) -> dict[str, Any]:
+        """Return all settings as JSON knows them, with the names of task and algorithm."""
+        own = {item.name: getattr(self, item.name) for item in fields(self)}
+        own["algorithm"] = {"name": self.algorithm.name, **asdict(self.algorithm)}
+        return {"task": self.task, **own}
+
+
+@dataclass(frozen=True)
+class CartPoleTraining(Training):
+    """A run on the cart-pole; attributes as in `Training`, and this.
+
+    Attributes:
+        effort_weight: At the task's 0.01 an agent balances at twice the effort.
+        largest_correction: The agent corrects LAG-ROS by at most so much [N]; None for an agent
+            that controls the cart-pole alone.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    task: ClassVar[str] = "cartpole"
+    largest_correction: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        if self.largest_correction is not None:
+            _check_numbers(self, ("largest_correction",), ())
+
+    @property
+    def label(self) -> str:
+        """Name of the runs that differ in the seed alone."""
+        if self.largest_correction is None:
+            return super().label
+        return f"residual-{self.algorithm.name}-{self.largest_correction:g}N"
+
+
+@dataclass(frozen=True)
+class SpacecraftTraining(Training):
+    """A run with spacecraft, one policy for all; attributes as in `Training`, and these.
+
+    Attributes:
+        effort_weight: That of the task.
+        preset: Preset of the scenarios. The agent sees no obstacles.
+        agents: Agents in each world.
+        time_limit: Of an episode in training [s]: most of the 45 s of the task are spent at the
+            goal, where there is little left to learn.
+        nearness_weight: Reward per second at a touch of another agent, negative sign applied.
+        nearness_range: Distance beyond touching at which that has fallen to nothing [m].
+        final_agents: Numbers of agents in the evaluation at the end.
+        final_bounds: Their d_bar.
+    """
+
+    task: ClassVar[str] = "spacecraft"
+    algorithm: Algorithm = field(
+        default_factory=lambda: Ppo(
+            rollout_steps=128, batch_size=4608, epochs=5, learning_rate=7e-4
+        )
+    )
+    segments: int = 10
+    segment_steps: int = 2560
+    worlds: int = 24
+    effort_weight: float = 0.02
+    disturbance_bound: float = 0.4
+    curve_episodes: int = 20
+    final_episodes: int = 200
+    preset: str = "open"
+    agents: int = 6
+    time_limit: float = 20.0
+    nearness_weight: float = 5.0
+    nearness_range: float = 0.5
+    final_agents: tuple[int, ...] = (3, 6)
+    final_bounds: tuple[float, ...] = (0.4,)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        _check_numbers(self, ("time_limit", "nearness_range"), ("agents",))
+
+    @property
+    def rows(self) -> int:
+        """Agents that learn side by side."""
+        return self.worlds * self.agents
+
+
+_BUFFERED: dict[str, Any] = {"segments": 24, "segment_steps": 125, "worlds": 128}
+# Algorithms of each task, with the settings that were found.
+DEFAULTS: dict[str, dict[str, Training]] = {
+    "cartpole": {
+        "ppo": CartPoleTraining(Ppo()),
+        "sac": CartPoleTraining(Sac(), effort_weight=0.01, **_BUFFERED),
+        "td3": CartPoleTraining(Td3(), effort_weight=0.01, **_BUFFERED),
+    },
+    "spacecraft": {"ppo": SpacecraftTraining()},
+}
+
+
+def default_training(task: str, algorithm: str) -> Training:
+    """Return the settings of a task and algorithm.
+
+    Raises:
+        ValueError: There are none.
+    """
+    if task not in DEFAULTS:
+        raise ValueError(f"task={task!r} must be one of {', '.join(DEFAULTS)}")
+    known = DEFAULTS[task]
+    if algorithm not in known:
+        close = difflib.get_close_matches(algorithm.lower(), known, n=1)
+        hint = f" Did you mean {close[0]!r}?" if close else ""
+        raise ValueError(
+            f"--algo {algorithm!r} is not known for {task}.{hint} Use one of {', '.join(known)}"
+        )
+    return known[algorithm]

@@ -1,0 +1,231 @@
+"""Actors that reinforcement learning has trained, as plain arrays, and the policies that run them.
+
+They run in NumPy: neither torch nor a pickle is loaded. `lagros train cartpole` writes them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs import cartpole_task as task
+from lagros_policies.imitation.networks import Mlp, read_safetensors, write_safetensors
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+Squash = Literal["clip", "tanh"]
+
+PRETRAINED = Path(__file__).parent / "pretrained"
+SQUASHES: tuple[Squash, ...] = ("clip", "tanh")
+
+_FORMAT = "lagros-actor-1"
+# Of files that are older than the choice of a squash: their actors clip.
+_CLIPPED_FORMAT = "lagros-ppo-actor-1"
+
+
+def goal_frame() -> FloatArray:
+    """Return F (4, 13): [p - p_f, theta, dp/dt, dtheta/dt] = F o, what the actors see."""
+    matrix = np.zeros((task.STATE_DIM, task.OBSERVATION_DIM))
+    matrix[:, task.STATE] = np.eye(task.STATE_DIM)
+    matrix[0, task.GOAL.start] = -1.0
+    return matrix
+
+
+@dataclass(frozen=True)
+class Actor:
+    """The mean action of an agent on the cart-pole as plain arrays.
+
+    With z = network(clip((F o - mean) / std, +-feature_clip)) the action is clip(z, +-action_clip)
+    or action_clip tanh(z).
+
+    Attributes:
+        network: The layers, tanh between them.
+        features: F, shape (k, 13).
+        mean: Mean of F o in the training, shape (k,).
+        std: Standard deviation of F o in the training, shape (k,), positive.
+        feature_clip: Bound on the normalised features.
+        action_clip: Bound on the action, in the units of the training.
+        force_scale: Force of the action 1.0 in the training [N].
+        squash: How the action is bounded, "clip" or "tanh".
+
+    Raises:
+        ValueError: The shapes do not fit together or a value is out of range.
+    """
+
+    network: Mlp
+    features: Float32Array
+    mean: Float32Array
+    std: Float32Array
+    feature_clip: float
+    action_clip: float
+    force_scale: float
+    squash: Squash = "clip"
+
+    def __post_init__(self) -> None:
+        """Check shapes and values."""
+        count = self.network.inputs
+        if self.network.outputs != 1 or self.features.shape != (count, task.OBSERVATION_DIM):
+            raise ValueError(
+                f"features {self.features.shape} and a network of {count} inputs and "
+                f"{self.network.outputs} outputs do not map an observation of "
+                f"{task.OBSERVATION_DIM} to one action"
+            )
+        for name in ("features", "mean", "std"):
+            array = getattr(self, name)
+            if not np.all(np.isfinite(array)) or (name != "features" and array.shape != (count,)):
+                raise ValueError(f"{name} of shape {array.shape} must be finite, one per feature")
+        if not np.all(self.std > 0.0):
+            raise ValueError("std must be positive")
+        for name in ("feature_clip", "action_clip", "force_scale"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name}={value!r} must be finite and > 0")
+        if self.squash not in SQUASHES:
+            raise ValueError(f"squash={self.squash!r} must be one of {', '.join(SQUASHES)}")
+
+    @property
+    def largest_force(self) -> float:
+        """The largest force that the actor can ask for [N]."""
+        return self.action_clip * self.force_scale
+
+    def save(self, path: Path | str) -> None:
+        """Write the actor as safetensors, atomically."""
+        tensors = {"features": self.features, "mean": self.mean, "std": self.std}
+        layers = zip(self.network.weights, self.network.biases, strict=True)
+        for index, (weight, bias) in enumerate(layers):
+            tensors[f"layer{index}.weight"] = weight
+            tensors[f"layer{index}.bias"] = bias
+        metadata = {
+            "format": _FORMAT,
+            "activation": "tanh",
+            "squash": self.squash,
+            "feature_clip": repr(self.feature_clip),
+            "action_clip": repr(self.action_clip),
+            "force_scale": repr(self.force_scale),
+        }
+        write_safetensors(path, tensors, metadata)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Actor:
+        """Read an actor; nothing in the file is executed.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file is damaged or not such an actor.
+        """
+        tensors, metadata = read_safetensors(path)
+        known = metadata.get("format") in (_FORMAT, _CLIPPED_FORMAT)
+        if not known or metadata.get("activation") != "tanh":
+            raise ValueError(
+                f"{path} is not an actor of this package: its metadata say {metadata!r}"
+            )
+        layers = sum(name.endswith(".weight") for name in tensors)
+        squash: Any = "clip" if metadata["format"] == _CLIPPED_FORMAT else metadata.get("squash")
+        try:
+            return cls(
+                network=Mlp(
+                    [tensors[f"layer{index}.weight"] for index in range(layers)],
+                    [tensors[f"layer{index}.bias"] for index in range(layers)],
+                ),
+                features=tensors["features"],
+                mean=tensors["mean"],
+                std=tensors["std"],
+                feature_clip=float(metadata["feature_clip"]),
+                action_clip=float(metadata["action_clip"]),
+                force_scale=float(metadata["force_scale"]),
+                squash=squash,
+            )
+        except KeyError as error:
+            raise ValueError(f"{path} lacks the entry {error}") from error
+        except ValueError as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
+
+
+class ActorPolicy:
+    """An actor in the place of a controller.
+
+    Args:
+        settings: The task; None for the paper's. Where its `force_scale` differs from that of the
+            training, the action is rescaled so that the force stays the same.
+        weights: A file written by `Actor.save`, or the actor itself; None for the shipped one.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is damaged.
+
+    Attributes:
+        actor: The arrays.
+    """
+
+    name = "actor"
+    weights_file = ""
+    observes: Literal["local", "global"] = "local"
+
+    def __init__(
+        self,
+        settings: task.CartPoleSettings | None = None,
+        weights: Path | str | Actor | None = None,
+    ) -> None:
+        """Load the actor; see the class for the arguments."""
+        self.settings = settings or task.CartPoleSettings()
+        if not isinstance(weights, Actor):
+            weights = Actor.load(PRETRAINED / self.weights_file if weights is None else weights)
+        self.actor = weights
+        self._network = weights.network
+        self._features = np.ascontiguousarray(weights.features.T)
+        self._mean, self._std = weights.mean, weights.std
+        self._feature_clip = np.float32(weights.feature_clip)
+        self._action_clip = np.float32(weights.action_clip)
+        self._scale = np.float32(weights.force_scale / self.settings.force_scale)
+
+    @classmethod
+    def load(cls, path: Path | str, settings: task.CartPoleSettings | None = None) -> Self:
+        """Return the policy of a file written by `Actor.save`; raises as the class does."""
+        return cls(settings, path)
+
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, Any]:
+        """Return the mean action and the state as it came; see `Policy.predict`."""
+        features = np.asarray(observation, np.float32) @ self._features
+        features -= self._mean
+        features /= self._std
+        bound = self._feature_clip
+        np.minimum(np.maximum(features, -bound, out=features), bound, out=features)
+        bound = self._action_clip
+        action = self._network(features)
+        if self.actor.squash == "tanh":
+            action = bound * np.tanh(action)
+        else:
+            action = np.minimum(np.maximum(action, -bound), bound)
+        return action * self._scale, state
+
+
+class PpoPolicy(ActorPolicy):
+    """The actor of proximal policy optimisation."""
+
+    name = "ppo"
+    weights_file = "cartpole_ppo.safetensors"
+
+
+class SacPolicy(ActorPolicy):
+    """The mean action of soft actor-critic."""
+
+    name = "sac"
+    weights_file = "cartpole_sac.safetensors"
+
+
+class Td3Policy(ActorPolicy):
+    """The actor of twin delayed deep deterministic policy gradients."""
+
+    name = "td3"
+    weights_file = "cartpole_td3.safetensors"

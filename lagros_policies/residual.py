@@ -1,0 +1,76 @@
+"""LAG-ROS with a learned correction: u = u_L + clip(c, +-beta), |c| at most beta newtons."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs import cartpole_task as task
+from lagros_policies.actor import Actor, ActorPolicy
+from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.policy import PolicyState
+
+Float32Array = NDArray[np.float32]
+
+
+class Correction(ActorPolicy):
+    """The correction alone, an actor whose largest force is beta."""
+
+    name = "correction"
+    weights_file = "cartpole_residual.safetensors"
+
+
+class ResidualPolicy:
+    """The force of LAG-ROS plus a correction that reinforcement learning has trained.
+
+    The bound of Theorem 1 holds for u_L with the learning error eps_l. A correction of at most beta
+    is a further error of u: the bound of the sum is that of eps_l + beta, whatever was learned. It
+    is looser, and nothing else is known about the correction.
+
+    Args:
+        settings: The task; None for the paper's.
+        weights: File or arrays of the correction, an `Actor`; None for the shipped one.
+        base: File of the network of LAG-ROS; None for the shipped one.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: A file is damaged.
+
+    Attributes:
+        base: The policy that is corrected.
+        correction: The policy that is added.
+    """
+
+    name = "residual"
+    observes: Literal["local", "global"] = "local"
+
+    def __init__(
+        self,
+        settings: task.CartPoleSettings | None = None,
+        weights: Path | str | Actor | None = None,
+        base: Path | str | None = None,
+    ) -> None:
+        """Load both networks; see the class for the arguments."""
+        self.settings = settings or task.CartPoleSettings()
+        self.base = LagrosPolicy(self.settings, base)
+        self.correction = Correction(self.settings, weights)
+
+    @property
+    def largest_correction(self) -> float:
+        """The bound beta of the correction [N]."""
+        return self.correction.actor.largest_force
+
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, PolicyState]:
+        """Return the sum of both actions and the state as it came; see `Policy.predict`."""
+        action, _ = self.base.predict(observation)
+        correction, _ = self.correction.predict(observation)
+        return action + correction, state

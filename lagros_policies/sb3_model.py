@@ -1,0 +1,156 @@
+"""Models of stable-baselines3 as policies of the cart-pole, loaded only where a user names one."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import zipfile
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs import cartpole_task as task
+
+Float32Array = NDArray[np.float32]
+
+ALGORITHMS = ("A2C", "DDPG", "PPO", "SAC", "TD3")
+
+
+class StableBaselines3Policy:
+    """A stable-baselines3 model with the interface and the checks of this package.
+
+    Args:
+        model: The model; its observation must be the 13 numbers of the cart-pole task, its action
+            one number.
+        name: Name in tables.
+
+    Raises:
+        ValueError: The model was trained on other spaces.
+    """
+
+    observes: Literal["local", "global"] = "local"
+
+    def __init__(self, model: Any, name: str) -> None:
+        """Wrap the model; see the class for the arguments."""
+        spaces = model.observation_space.shape, model.action_space.shape
+        if spaces != ((task.OBSERVATION_DIM,), (1,)):
+            raise ValueError(
+                f"{name} was trained on observations of shape {spaces[0]} and actions of shape "
+                f"{spaces[1]}; lagros/CartPole-v0 has ({task.OBSERVATION_DIM},) and (1,). A model "
+                "that was trained behind wrappers cannot be used without them"
+            )
+        self.name = name
+        self.model = model
+
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, Any]:
+        """Return the model's action and state; see `Policy.predict`."""
+        action, state = self.model.predict(
+            np.asarray(observation, np.float32), state, episode_start, deterministic
+        )
+        return np.asarray(action, np.float32), state
+
+
+def load_stable_baselines3(
+    path: Path | str, algorithm: str | None = None
+) -> StableBaselines3Policy:
+    """Load a model saved by stable-baselines3's `model.save(path)`.
+
+    Such a zip holds pickles, which is to say code: loading it runs whatever its author put there.
+    This package loads one only where the caller names it, ships none, and unpickles nothing in
+    order to find out the algorithm. Load only files that you trust.
+
+    Args:
+        path: The zip file.
+        algorithm: One of `ALGORITHMS`, in any case; None to detect it.
+
+    Returns:
+        The policy, on the CPU, named after the file.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ImportError: The extra `rl` is not installed.
+        ValueError: The file is no such model, its algorithm is unknown or cannot be detected, or
+            its spaces are not those of the task.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no stable-baselines3 model {path}")
+    chosen = detect_algorithm(path) if algorithm is None else algorithm.upper()
+    if chosen not in ALGORITHMS:
+        raise ValueError(f"algorithm {algorithm!r} is not known; use one of {_known()}")
+    try:
+        library = importlib.import_module("stable_baselines3")
+    except ImportError as error:
+        raise ImportError(
+            f"{path} needs stable-baselines3: pip install 'lagros[rl]' (or 'lagros[all]')"
+        ) from error
+    try:
+        model = getattr(library, chosen).load(path, device="cpu")
+    except Exception as error:  # a pickle can raise anything
+        raise ValueError(
+            f"{path} could not be loaded as a {chosen} model of stable-baselines3 "
+            f"{library.__version__} ({type(error).__name__}: {error})"
+        ) from error
+    return StableBaselines3Policy(model, path.stem)
+
+
+def detect_algorithm(path: Path | str) -> str:
+    """Tell the algorithm of a stable-baselines3 zip from its JSON part, unpickling nothing.
+
+    The zip does not name its class. Its entry `data` is a JSON object of the model's attributes,
+    and these differ: only PPO has a `clip_range`, only SAC a `target_entropy`, only TD3 and DDPG a
+    `target_policy_noise`. A2C shares its policy class with PPO alone. DDPG is the TD3 without
+    delay and without clipped noise.
+
+    Args:
+        path: The zip file.
+
+    Returns:
+        One of `ALGORITHMS`.
+
+    Raises:
+        ValueError: The file is no stable-baselines3 zip, or of another algorithm.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            data = json.loads(archive.read("data"))
+    except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
+        raise ValueError(
+            f"{path} is not a model saved by stable-baselines3: it has no readable entry 'data' "
+            f"({error})"
+        ) from error
+    if not isinstance(data, dict):
+        raise _unclear(path)
+    kind = data.get("policy_class")
+    module = kind.get("__module__", "") if isinstance(kind, dict) else ""
+    if not str(module).startswith("stable_baselines3."):
+        raise _unclear(path)  # of sb3_contrib, or a policy class of the user's own
+    if "target_policy_noise" in data:
+        plain = data.get("policy_delay") == 1 and data.get("target_noise_clip") == 0.0
+        return "DDPG" if plain else "TD3"
+    if "target_entropy" in data:
+        return "SAC"
+    if "clip_range" in data and "n_epochs" in data:
+        return "PPO"
+    if "gae_lambda" in data and "normalize_advantage" in data:
+        return "A2C"
+    raise _unclear(path)
+
+
+def _unclear(path: Path | str) -> ValueError:
+    return ValueError(
+        f"{path} does not tell which algorithm it is of; say so with a prefix, e.g. ppo:{path} "
+        f"(one of {_known()})"
+    )
+
+
+def _known() -> str:
+    return ", ".join(name.lower() for name in ALGORITHMS)

@@ -1,0 +1,421 @@
+"""`lagros train`: its settings, its runs, what they resume from, and the curves of seeds."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+
+import torch
+from typer.testing import CliRunner
+
+from lagros_benchmarks import train as command
+from lagros_benchmarks import train_cartpole
+from lagros_benchmarks.cli import app
+from lagros_benchmarks.sb3_vector import SB3VectorEnv
+from lagros_benchmarks.settings import BenchmarkSettings
+from lagros_benchmarks.train_curves import curves_of, draw, range_confidence
+from lagros_benchmarks.train_lessons import lesson_of
+from lagros_benchmarks.train_run import Place, train
+from lagros_benchmarks.train_settings import (
+    CURVE,
+    DEFAULTS,
+    FINAL,
+    CartPoleTraining,
+    OffPolicy,
+    Ppo,
+    Sac,
+    SpacecraftTraining,
+    Td3,
+    Training,
+    default_training,
+)
+from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.cartpole_vector import CartPoleVectorEnv
+from lagros_envs.seeding import EVALUATION, episode_seeds
+from lagros_policies.actor import Actor, ActorPolicy
+from lagros_policies.imitation.networks import Mlp
+from lagros_policies.lagros import LagrosPolicy
+
+BUFFER = {"batch_size": 32, "gradient_steps": 3, "warm_up": 64, "hidden": (8,)}
+ALGORITHMS = {
+    "ppo": Ppo(rollout_steps=12, batch_size=48, epochs=2, hidden=(8,)),
+    # A buffer that runs over, so that its position matters.
+    "sac": Sac(**BUFFER, buffer_size=320),
+    "td3": Td3(**BUFFER, buffer_size=1000),
+}
+TINY = CartPoleTraining(
+    ALGORITHMS["ppo"],
+    segments=3,
+    segment_steps=24,
+    worlds=8,
+    curve_episodes=6,
+    final_episodes=6,
+)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def run(training, folder, **options):
+    return train(training, Place(folder, **options), lambda: lesson_of(training), "a command")
+
+
+# Settings
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"segments": 0},
+        {"segments": 1 << 16},
+        {"worlds": 1.5},
+        {"seed": -1},
+        {"segment_steps": 13},
+        {"largest_correction": 0.0},
+        {"largest_correction": float("inf")},
+    ],
+)
+def test_runs_that_make_no_sense_are_refused(change):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        replace(TINY, **change)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "change"),
+    [("ppo", {"epochs": 0}), ("ppo", {"clip_range": 0.0}), ("sac", {"averaging": -1.0})],
+)
+def test_hyperparameters_that_make_no_sense_are_refused(algorithm, change):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        replace(ALGORITHMS[algorithm], **change)
+
+
+def test_every_default_can_be_built_and_written_down():
+    for task, algorithms in DEFAULTS.items():
+        for name, training in algorithms.items():
+            assert default_training(task, name) is training
+            assert training.record()["algorithm"]["name"] == name
+            json.dumps(training.record(), allow_nan=False)
+            if isinstance(training.algorithm, OffPolicy):
+                # Nothing that was met is forgotten.
+                whole = training.segments * training.steps_of_segment
+                assert training.algorithm.buffer_size >= whole
+    with pytest.raises(ValueError, match="Did you mean 'ppo'"):
+        default_training("cartpole", "pppo")
+    with pytest.raises(ValueError, match="must be one of cartpole, spacecraft"):
+        default_training("cartpoles", "ppo")
+
+
+def test_no_episode_of_training_or_its_figures_is_one_of_the_benchmark():
+    benchmark = set(BenchmarkSettings(episodes=2000).episode_seeds())
+    assert benchmark.isdisjoint(episode_seeds(0, 2000, CURVE))
+    assert benchmark.isdisjoint(episode_seeds(0, 2000, FINAL))
+    assert set(episode_seeds(0, 2000, CURVE)).isdisjoint(episode_seeds(0, 2000, FINAL))
+    # The streams of the segments are namespaces of the run's seed.
+    starts = {
+        tuple(np.random.SeedSequence(0, spawn_key=(key,)).generate_state(4))
+        for key in (*range(1000), EVALUATION, CURVE, FINAL)
+    }
+    assert len(starts) == 1003
+
+
+# Runs
+
+
+@pytest.mark.parametrize("correction", [None, 4.0])
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_a_run_that_was_killed_ends_with_the_same_weights(name, correction, tmp_path, monkeypatch):
+    training = replace(TINY, algorithm=ALGORITHMS[name], largest_correction=correction)
+    whole = run(training, tmp_path / "whole")
+    calls = []
+    evaluate = train_cartpole.evaluate
+
+    def killed(*arguments):
+        calls.append(arguments)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return evaluate(*arguments)
+
+    monkeypatch.setattr(train_cartpole, "evaluate", killed)
+    folder = tmp_path / "cut"
+    with pytest.raises(KeyboardInterrupt):
+        run(training, folder)
+    assert [path.name for path in folder.iterdir()] == ["checkpoint.pt"]
+    cut = run(training, folder)
+    file = "weights.safetensors"
+    assert (folder / file).read_bytes() == (tmp_path / "whole" / file).read_bytes()
+    for record in (whole, cut):
+        assert record["curve"]["steps"] == [192, 384, 576]
+        del record["curve"]["seconds"], record["curve"]["cpu_seconds"]
+    assert cut["curve"] == whole["curve"]
+    assert cut["final"] == whole["final"]
+    assert sorted(path.name for path in folder.iterdir()) == ["record.json", "weights.safetensors"]
+    # A complete run is read and not run again.
+    again = train(training, Place(folder), lambda: pytest.fail("it was complete"))
+    assert again["final"] == whole["final"]
+
+
+def test_the_folder_of_another_run_is_refused(tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    monkeypatch.setattr(train_cartpole.CartPoleLesson, "final", lambda *_: pytest.fail("too far"))
+    with pytest.raises(pytest.fail.Exception):
+        run(TINY, folder)
+    other = replace(TINY, seed=1)
+    with pytest.raises(ValueError, match="belongs to another run"):
+        run(other, folder)
+    checkpoint = folder / "checkpoint.pt"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    with pytest.raises(ValueError, match="is damaged"):
+        run(TINY, folder)
+    (folder / "record.json").write_text('{"training": {}}')
+    with pytest.raises(ValueError, match="holds another run"):
+        run(TINY, folder)
+    (folder / "record.json").write_text("{")
+    with pytest.raises(ValueError, match="is damaged"):
+        run(TINY, folder)
+
+
+def test_the_record_says_what_the_weights_depend_on(tmp_path):
+    training = replace(TINY, segments=1, algorithm=ALGORITHMS["sac"])
+    record = run(training, tmp_path)
+    assert record == json.loads((tmp_path / "record.json").read_text())
+    assert record["command"] == "a command"
+    assert record["training"]["algorithm"]["gradient_steps"] == 3
+    assert record["training"]["disturbance_bound"] == 0.75
+    assert {"torch", "stable-baselines3", "numpy"} <= set(record["versions"])
+    assert [row["disturbance"] for row in record["final"]] == ["none", "uniform"]
+    actor = Actor.load(tmp_path / "weights.safetensors")
+    assert actor.squash == "tanh"
+    figures = train_cartpole.evaluate(
+        ActorPolicy(weights=actor), episode_seeds(0, 6, FINAL), "uniform", 0.75
+    )
+    assert figures["effort"] == pytest.approx(record["final"][1]["effort"], abs=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_events_hold_the_curve_once_also_after_a_kill(tmp_path, monkeypatch):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    training = replace(TINY, algorithm=ALGORITHMS["td3"])
+    saved = []
+    save = train_cartpole.CartPoleLesson.figures
+
+    def killed_once(lesson, model):
+        figures = save(lesson, model)
+        saved.append(figures)
+        return figures
+
+    monkeypatch.setattr(train_cartpole.CartPoleLesson, "figures", killed_once)
+    from lagros_benchmarks import train_run
+
+    write = train_run._save
+
+    def dies(path, settings, model, curve):
+        if len(saved) == 2:
+            saved.append(None)
+            raise KeyboardInterrupt  # after the events of the segment, before its checkpoint
+        write(path, settings, model, curve)
+
+    monkeypatch.setattr(train_run, "_save", dies)
+    with pytest.raises(KeyboardInterrupt):
+        run(training, tmp_path, tensorboard=True)
+    record = run(training, tmp_path, tensorboard=True)
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    written = events.Scalars("evaluation/effort")
+    assert [event.step for event in written] == record["curve"]["steps"]
+    assert [event.value for event in written] == pytest.approx(record["curve"]["effort"])
+    assert any(name.startswith("train/") for name in events.Tags()["scalars"])
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_for_good_goes_on(tmp_path):
+    program = (
+        "import sys; sys.argv = ['lagros', 'train', 'cartpole', '--algo', 'td3', "
+        "'--segments', '3', '--out', sys.argv[1]]; from lagros_benchmarks.cli import app; app()"
+    )
+
+    def start(folder):
+        return subprocess.Popen([sys.executable, "-c", program, str(folder)])
+
+    assert start(tmp_path / "whole").wait(timeout=280) == 0
+    process = start(tmp_path / "cut")
+    checkpoint = tmp_path / "cut" / "cartpole-td3" / "seed-0" / "checkpoint.pt"
+    while not checkpoint.exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not checkpoint.with_name("record.json").exists()
+    assert start(tmp_path / "cut").wait(timeout=280) == 0
+    weights = "cartpole-td3/seed-0/weights.safetensors"
+    assert (tmp_path / "cut" / weights).read_bytes() == (tmp_path / "whole" / weights).read_bytes()
+
+
+# The cart-pole
+
+
+def test_the_corrected_worlds_are_moved_by_both():
+    settings = CartPoleSettings()
+    worlds = CartPoleVectorEnv(5, "uniform", settings=settings, autoreset_mode="same_step")
+    env = train_cartpole.CorrectedWorlds(
+        SB3VectorEnv(worlds), LagrosPolicy(settings), 4.0, settings.force_scale
+    )
+    plain = CartPoleVectorEnv(5, "uniform", settings=settings, autoreset_mode="same_step")
+    env.seed(3)
+    ours = env.reset()
+    theirs, _ = plain.reset(seed=3)
+    rng = np.random.default_rng(0)
+    base = LagrosPolicy(settings)
+    for _ in range(100):  # past the end of the episodes
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+        correction = rng.uniform(-2.0, 2.0, (5, 1)).astype(np.float32)
+        force = settings.force_scale * base.predict(theirs)[0] + 4.0 * np.clip(correction, -1, 1)
+        ours, reward, _, _ = env.step(correction)
+        theirs, expected, *_ = plain.step(force / settings.force_scale)
+        np.testing.assert_allclose(reward, expected, rtol=1e-4, atol=1e-4)
+    with pytest.raises(RuntimeError, match="reset"):
+        train_cartpole.CorrectedWorlds(SB3VectorEnv(worlds), base, 4.0, 40.0).step_async(
+            np.zeros((5, 1))
+        )
+
+
+def test_the_figures_count_what_happens_before_the_first_fall():
+    class Never(ActorPolicy):
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            return np.zeros((len(observation), 1), np.float32), state
+
+    actor = Actor(
+        network=Mlp([np.zeros((4, 1))], [np.zeros(1)]),
+        features=np.eye(4, 13, dtype=np.float32),
+        mean=np.zeros(4, np.float32),
+        std=np.ones(4, np.float32),
+        feature_clip=1.0,
+        action_clip=1.0,
+        force_scale=40.0,
+    )
+    figures = train_cartpole.evaluate(Never(weights=actor), episode_seeds(1, 50), "none", 0.0)
+    assert figures["fallen"] == 1.0
+    assert figures["strict"] == 0.0
+    assert figures["effort"] == 0.0
+    assert figures["success"] < 0.5
+
+
+# Curves
+
+
+def fake_record(name, seed, values, correction=None):
+    training = replace(TINY, algorithm=ALGORITHMS[name], seed=seed, largest_correction=correction)
+    curve = {"steps": [192, 384], "seconds": [1.0, 2.0], "cpu_seconds": [1.0, 2.0]}
+    figures = dict.fromkeys(("success", "strict", "effort"), values)
+    record = json.loads(json.dumps(training.record()))
+    return {"training": record, "curve": curve | figures, "final": [{"success": values[-1]}]}
+
+
+def test_curves_hold_median_and_range_of_the_seeds(tmp_path):
+    ours = [fake_record("ppo", seed, [0.1 * seed, 0.5]) for seed in (0, 4, 1, 3, 2)]
+    other = [fake_record("td3", 0, [0.0, 1.0], correction=4.0)]
+    curves = curves_of([*ours, *other], "a command")
+    first, second = curves["curves"]
+    assert (first["label"], second["label"]) == ("ppo", "residual, 4 N (td3)")
+    assert first["seeds"] == [0, 4, 1, 3, 2]
+    spread = first["figures"]["success"]
+    assert spread["median"] == pytest.approx([0.2, 0.5])
+    assert spread["least"] == pytest.approx([0.0, 0.5])
+    assert spread["largest"] == pytest.approx([0.4, 0.5])
+    assert first["confidence_of_range"] == 0.9375
+    json.dumps(curves, allow_nan=False)
+    assert draw(curves, tmp_path / "a.png").stat().st_size > 1000
+    changed = fake_record("ppo", 7, [0.0, 0.0])
+    changed["training"]["worlds"] = 9
+    with pytest.raises(ValueError, match="differ in more than the seed"):
+        curves_of([*ours, changed], "a command")
+    with pytest.raises(ValueError, match="one task"):
+        curves_of([], "a command")
+
+
+def test_the_range_holds_the_median_as_often_as_it_says():
+    draws = np.random.default_rng(0).exponential(size=(20_000, 5))
+    held = np.mean((draws.min(axis=1) < np.log(2.0)) & (draws.max(axis=1) > np.log(2.0)))
+    assert held == pytest.approx(range_confidence(5), abs=0.006)
+    with pytest.raises(ValueError, match="runs=0"):
+        range_confidence(0)
+
+
+# The command
+
+
+def test_the_command_trains_several_runs_and_draws_them(tmp_path, monkeypatch):
+    monkeypatch.setitem(DEFAULTS["cartpole"], "ppo", TINY)
+    monkeypatch.setitem(DEFAULTS["cartpole"], "td3", replace(TINY, algorithm=ALGORITHMS["td3"]))
+    arguments = ["train", "cartpole", "--algo", "ppo,td3", "--seed", "0,1", "--segments", "1"]
+    files = ["--json", str(tmp_path / "a.json"), "--figure", str(tmp_path / "a.png")]
+    out = ["--out", str(tmp_path / "runs")]
+    result = CliRunner().invoke(app, [*arguments, *out, *files])
+    assert result.exit_code == 0, result.output
+    curves = json.loads((tmp_path / "a.json").read_text())["curves"]
+    assert [(curve["label"], curve["seeds"]) for curve in curves] == [
+        ("ppo", [0, 1]),
+        ("td3", [0, 1]),
+    ]
+    record = json.loads((tmp_path / "runs/cartpole-td3/seed-1/record.json").read_text())
+    assert record["command"] == "lagros train cartpole --algo td3 --seed 1 --segments 1"
+    assert (tmp_path / "a.png").exists()
+    # The same again: nothing is trained.
+    monkeypatch.setattr("lagros_benchmarks.train_run.make_agent", lambda *_: pytest.fail("again"))
+    assert CliRunner().invoke(app, [*arguments, *out, *files]).exit_code == 0
+
+
+def test_the_folder_of_a_run_names_what_it_is(tmp_path):
+    corrected = replace(TINY, largest_correction=2.5, seed=3)
+    assert command.folder_of(TINY, tmp_path) == tmp_path / "cartpole-ppo" / "seed-0"
+    expected = tmp_path / "cartpole-residual-ppo-2.5N" / "seed-3"
+    assert command.folder_of(corrected, tmp_path) == expected
+    assert command.folder_of(SpacecraftTraining(), tmp_path).parts[-2:] == (
+        "spacecraft-ppo",
+        "seed-0",
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["cartpole", "--algo", "trpo"], "Use one of ppo, sac, td3"),
+        (["spacecraft", "--algo", "sac"], "not known for spacecraft"),
+        (["rocket"], "must be one of cartpole, spacecraft"),
+        (["cartpole", "--seed", "-1"], "seed=-1"),
+        (["cartpole", "--seed", "a"], "'a' is not a whole number"),
+        (["cartpole", "--seed", ""], "must not be empty"),
+        (["cartpole", "--segments", "0"], "segments=0"),
+        (["cartpole", "--parallel-env"], "for spacecraft"),
+        (["spacecraft", "--residual", "3"], "for cartpole"),
+        (["cartpole", "--residual", "-3"], "largest_correction=-3.0"),
+        (["cartpole", "--figure", "a.txt"], "must end in"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_refused(arguments, text, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["train", *arguments])
+    assert result.exit_code == 2
+    assert text in result.output
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_task_that_is_not_known_has_no_lesson():
+    with pytest.raises(TypeError, match="of no task"):
+        lesson_of(Training())
