@@ -26,7 +26,7 @@ TINY = timing.Scale(
 def test_every_topic_gives_rows_and_a_file(tmp_path):
     topics = (planner, sdp, network, environment)
     sections = [section for topic in topics for section in topic.sections(TINY)]
-    assert len(sections) == 12
+    assert len(sections) == 13
     assert all(section.rows for section in sections)
     shown = io.StringIO()
     console = Console(file=shown, width=report.WIDTH)
