@@ -322,7 +322,7 @@ def _dask(address: str | None, jobs: int) -> Iterator[Any]:
                 distributed.LocalCluster(
                     n_workers=jobs,
                     threads_per_worker=1,
-                    dashboard_address=None,
+                    dashboard_address=":0",  # any free port, and no warning where 8787 is taken
                     silence_logs=logging.CRITICAL,
                 )
             )

@@ -41,7 +41,7 @@ def cluster(request):
     else:
         distributed = pytest.importorskip("distributed", reason="the extra `dask` is not installed")
         place = distributed.LocalCluster(
-            n_workers=3, threads_per_worker=1, dashboard_address=None, silence_logs=50
+            n_workers=3, threads_per_worker=1, dashboard_address=":0", silence_logs=50
         )
         backend, close = Backend("dask", place.scheduler_address), place.close
     with running(backend, 1):
@@ -122,7 +122,7 @@ def test_chunks_share_a_process_of_dask_one_at_a_time():
     distributed = pytest.importorskip("distributed", reason="the extra `dask` is not installed")
     with (
         distributed.LocalCluster(
-            n_workers=1, threads_per_worker=4, processes=False, dashboard_address=None
+            n_workers=1, threads_per_worker=4, processes=False, dashboard_address=":0"
         ) as place,
         distributed.Client(place),
     ):
