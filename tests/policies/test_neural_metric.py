@@ -27,7 +27,7 @@ from lagros_policies.contraction.neural_metric import (
     load_neural_metric,
     save_neural_metric,
 )
-from lagros_policies.contraction.neural_training import NeuralTrainingSettings
+from lagros_policies.contraction.neural_training import NeuralTrainingSettings, fit_network
 from lagros_policies.imitation.networks import Mlp
 from lagros_policies.metric_design import MetricDesignSettings, tube_samples
 
@@ -145,6 +145,33 @@ def test_rounds_look_for_what_is_violated():
 def test_too_fast_a_rate_is_refused():
     with pytest.raises(InfeasibleError, match="alpha=30"):
         solve_at_angles(MODEL, triples(20), REGION, CvStemSettings(contraction_rate=30.0), 2)
+
+
+@pytest.mark.slow
+def test_the_network_learns_the_solution_and_then_the_condition():
+    region = Region(angle=0.8, angular_rate=2.0, angle_error=0.2, angular_rate_error=0.8, force=5)
+    pool = triples(60, 1)
+    settings = CvStemSettings(contraction_rate=0.3)
+    solution = solve_at_angles(MODEL, triples(25, 1), region, settings, 4)
+    short = NeuralTrainingSettings(hidden=(16, 16), fit_steps=1500, condition_steps=0, batch=32)
+    fitted = fit_network(MODEL, pool, solution, region, short)
+    states = np.zeros((50, 4))
+    states[:, 1] = np.linspace(0.0, region.angle, 50)
+    # W_bar of both, up to a factor: it changes no control.
+    scale = SCALING[:, None] * SCALING
+    learned, wanted = fitted.dual(states) * scale, solution.dual(states) * scale
+    learned *= np.trace(wanted, axis1=1, axis2=2).sum() / np.trace(learned, axis1=1, axis2=2).sum()
+    distance = np.linalg.norm(learned - wanted, axis=(1, 2))
+    assert np.all(distance < 0.2 * np.linalg.norm(wanted, axis=(1, 2)))
+    least, largest = fitted.extreme_eigenvalues()
+    assert 0.0 < least < largest
+    trained = fit_network(MODEL, pool, solution, region, replace(short, condition_steps=150))
+    before, after = (
+        contraction_residual(MODEL, metric, pool).max() for metric in (fitted, trained)
+    )
+    assert after < before
+    again = fit_network(MODEL, pool, solution, region, short)
+    np.testing.assert_array_equal(again.matrix(states), fitted.matrix(states))
 
 
 def test_file_keeps_everything(tmp_path):
