@@ -26,7 +26,8 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 def machine() -> dict[str, Any]:
     """Return what the run ran on."""
     return {
-        "platform": platform.platform(),
+        # Not platform.platform(): the release of a kernel may name its host.
+        "platform": f"{platform.system()} {platform.machine()}",
         "processor": _processor(),
         "cpu_count": os.cpu_count(),
         "cpus_usable": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
