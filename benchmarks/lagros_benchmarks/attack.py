@@ -88,6 +88,8 @@ def attack(
 
             settings = replace(settings, safety_filter=True)
         _search(settings, json, npz)
+    except FileNotFoundError as error:
+        fail(f"there is no file {error.filename}; --npz of an earlier attack writes one")
     except (ValueError, OSError) as error:
         fail(error)
     except ImportError as error:
@@ -109,6 +111,10 @@ def _settings(
     from lagros_benchmarks.worst_case_attack import AttackSettings
 
     check_task(task)
+    if task == "spacecraft" and method != "hybrid":
+        raise ValueError(
+            f"--method {method}: the spacecraft has one search only; leave --method out"
+        )
     flights = BUDGETS[task] if budget is None else budget
     population = 30 if task == "cartpole" else 16
     return AttackSettings(

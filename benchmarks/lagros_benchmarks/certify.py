@@ -78,6 +78,8 @@ def certify(
     )
     try:
         found = certified(metric, policy, level, episodes, seconds)
+    except FileNotFoundError as error:
+        fail(f"--metric: there is no file {error.filename}", status=1)
     except (ValueError, OSError, RuntimeError) as error:
         # A metric that cannot be read, or is none, is a certificate that cannot be given.
         fail(error, status=1)

@@ -17,7 +17,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics.spacecraft import HEADING, Spacecraft
+from lagros_envs.dynamics.spacecraft import HEADING, SPIN, Spacecraft
 
 FloatArray = NDArray[np.float64]
 
@@ -102,3 +102,23 @@ def thrust_for_acceleration(
         acceleration: Of x, y and heading, shape (..., 3) [m/s^2, m/s^2, rad/s^2].
     """
     return allocate(body, wrench_of_acceleration(body, state, acceleration))
+
+
+def held_thrust(
+    body: Spacecraft, state: FloatArray, acceleration: FloatArray, period: float
+) -> FloatArray:
+    """Return the u >= 0 of least norm that gives an acceleration over a hold, shape (..., 8) [N].
+
+    The wrench is held in the body's axes, which turn: it is made for the heading in the middle of
+    the hold.
+
+    Args:
+        body: The spacecraft.
+        state: x at the beginning, shape (..., 6).
+        acceleration: Of x, y and heading, shape (..., 3) [m/s^2, m/s^2, rad/s^2].
+        period: The hold's [s].
+    """
+    middle = np.array(np.broadcast_to(state, (*acceleration.shape[:-1], 6)))
+    turn = 0.125 * period * period * acceleration[..., 2]
+    middle[..., HEADING] += 0.5 * period * middle[..., SPIN] + turn
+    return thrust_for_acceleration(body, middle, acceleration)

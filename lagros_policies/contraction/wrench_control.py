@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics.spacecraft import HEADING, SPIN, Spacecraft
+from lagros_envs.dynamics.spacecraft import Spacecraft
 from lagros_policies.contraction.double_integrator import AxisMetric, design_axis, flow
-from lagros_policies.contraction.thrusters import thrust_for_acceleration
+from lagros_policies.contraction.thrusters import held_thrust
 
 FloatArray = NDArray[np.float64]
 
@@ -149,13 +149,6 @@ class WrenchTracking:
     def control(
         self, state: FloatArray, nominal: FloatArray, nominal_acceleration: FloatArray
     ) -> FloatArray:
-        """Return u*, shape (..., 8), all >= 0 [N]; arguments as of `acceleration`.
-
-        The wrench is held in the body's axes, which turn: it is made for the heading in the middle
-        of the hold.
-        """
+        """Return u*, shape (..., 8), all >= 0 [N]; arguments as of `acceleration`."""
         wanted = self.acceleration(state, nominal, nominal_acceleration)
-        h = self.plane.period
-        middle = np.array(np.broadcast_to(state, (*wanted.shape[:-1], 6)))
-        middle[..., HEADING] += 0.5 * h * middle[..., SPIN] + 0.125 * h * h * wanted[..., 2]
-        return thrust_for_acceleration(self.body, middle, wanted)
+        return held_thrust(self.body, state, wanted, self.plane.period)

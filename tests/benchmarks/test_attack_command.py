@@ -45,6 +45,8 @@ def test_attack_writes_its_figures_and_flies_them_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (["spacecraft", "--method", "cma"], "leave --method out"),
+        (["cartpole", "--replay", "none.npz"], "there is no file none.npz"),
         (["boat"], "unknown task 'boat'"),
         (["cartpole", "--goal", "speed"], "goal='speed'"),
         (["cartpole", "--method", "annealing"], "method='annealing'"),

@@ -214,3 +214,17 @@ def test_the_parts_of_an_observation_are_what_the_layout_says(scene):
     np.testing.assert_allclose(sensed.spin, states[:, 5], atol=1e-6)
     apart = np.linalg.norm(states[:, None, :2] - states[None, :, :2], axis=-1)
     np.testing.assert_array_equal(sensed.neighbour_mask.sum(1), (apart <= 2.0).sum(1) - 1)
+
+
+def test_to_be_late_is_to_have_left_later(weights, scene):
+    env, rows = scene
+    policy = SpacecraftNetworkPolicy(env.settings, env.preset, weights=weights)
+    goal, time = policy.layout.slices["goal"], policy.layout.slices["time"]
+    far, near = np.tile(rows[:1], (3, 1)), np.tile(rows[:1], (2, 1))
+    # 3 m at 0.3 m/s are 10 s, whatever the clock says from 20 s on; the horizon is 30 s.
+    far[:, goal], far[:, time] = (3.0, 0.0), [[10.0], [20.0], [44.0]]
+    early, on_time, late = policy.predict(far)[0]
+    np.testing.assert_array_equal(late, on_time)
+    assert not np.allclose(early, on_time)
+    near[:, goal], near[:, time] = (0.1, 0.0), [[28.0], [44.0]]
+    np.testing.assert_array_equal(*policy.predict(near)[0])
