@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from lagros_benchmarks.worst_case_attack import AttackSettings
-    from lagros_benchmarks.worst_case_replay import Outcome
+    from lagros_benchmarks.worst_case.attack import AttackSettings
+    from lagros_benchmarks.worst_case.replay import Outcome
 
 BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
 # Flights per episode: a flight of six spacecraft costs what a hundred of a cart-pole do.
@@ -107,8 +107,8 @@ def _settings(
     method: str,
 ) -> AttackSettings:
     from lagros_benchmarks.settings import check_task
-    from lagros_benchmarks.worst_case import SearchSettings
-    from lagros_benchmarks.worst_case_attack import AttackSettings
+    from lagros_benchmarks.worst_case.attack import AttackSettings
+    from lagros_benchmarks.worst_case.search import SearchSettings
 
     check_task(task)
     if task == "spacecraft" and method != "hybrid":
@@ -130,8 +130,8 @@ def _settings(
 
 def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> None:
     from lagros_benchmarks.files import write_json
-    from lagros_benchmarks.worst_case_attack import run_attack
-    from lagros_benchmarks.worst_case_replay import save_worst_cases
+    from lagros_benchmarks.worst_case.attack import run_attack
+    from lagros_benchmarks.worst_case.replay import save_worst_cases
 
     found = run_attack(settings, lambda text: typer.echo(text, err=True))
     for line in summary(found.row):
@@ -145,8 +145,8 @@ def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> No
 
 
 def _replay(task: str, path: Path) -> None:
-    from lagros_benchmarks.worst_case_attack import fly_again
-    from lagros_benchmarks.worst_case_replay import load_worst_cases
+    from lagros_benchmarks.worst_case.attack import fly_again
+    from lagros_benchmarks.worst_case.replay import load_worst_cases
 
     cases = load_worst_cases(path)
     if cases.command.get("task") != task:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.spacecraft_episodes import fly_chunk
-from lagros_benchmarks.worst_case_cartpole import (
+from lagros_benchmarks.worst_case.cartpole import (
     Episodes,
     draw_episodes,
     fly,
@@ -24,7 +24,7 @@ from lagros_benchmarks.worst_case_cartpole import (
     random_pushes,
     tracking_law,
 )
-from lagros_benchmarks.worst_case_settings import CALIBRATION
+from lagros_benchmarks.worst_case.seeds import CALIBRATION
 from lagros_envs import cartpole_task as task
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv

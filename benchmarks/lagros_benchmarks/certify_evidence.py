@@ -18,7 +18,7 @@ from lagros_policies.contraction import Metric, Samples
 from lagros_policies.contraction.certificate import Certificate
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.double_integrator import AxisMetric
-from lagros_policies.contraction.prove_box import ProofBox
+from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.statement import Statement
 from lagros_policies.contraction.theorems import contraction_distance
 from lagros_policies.contraction.tube_design import (
@@ -165,14 +165,14 @@ def fly_cartpole(policy: str, bound: float, count: int) -> CartPoleFlights:
         bound: d_bar, in units of the state per second.
         count: Episodes of each kind.
     """
-    from lagros_benchmarks.worst_case_cartpole import (
+    from lagros_benchmarks.worst_case.cartpole import (
         draw_episodes,
         fly,
         policy_law,
         random_pushes,
         tracking_law,
     )
-    from lagros_benchmarks.worst_case_settings import CALIBRATION
+    from lagros_benchmarks.worst_case.seeds import CALIBRATION
     from lagros_envs.seeding import episode_seeds
     from lagros_policies.expert import CartPoleExpert
     from lagros_policies.lagros import LagrosPolicy
@@ -277,7 +277,7 @@ def fly_spacecraft(
         The statement, and the largest position error [m].
     """
     from lagros_benchmarks.calibration import POSITION_ERROR, spacecraft_scores
-    from lagros_benchmarks.worst_case_settings import CALIBRATION
+    from lagros_benchmarks.worst_case.seeds import CALIBRATION
 
     begun = time.monotonic()
     margin = float(found.details["tubes"]["position_held_without_learning_error"])
@@ -330,8 +330,8 @@ def cartpole_proofs(
     Returns:
         The box of x, x_d and u_d, and the statements, or None if they are still to be made.
     """
-    from lagros_policies.contraction.prove_cartpole import prove_cartpole
-    from lagros_policies.contraction.prove_program import ProvedDesignSettings
+    from lagros_policies.contraction.proof.cartpole import prove_cartpole
+    from lagros_policies.contraction.proof.program import ProvedDesignSettings
 
     if not large:
         return SMALL_BOX, None

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from lagros_benchmarks.train_settings import Training
+    from lagros_benchmarks.training.settings import Training
 
 RUNS = Path("runs/train")
 
@@ -66,7 +66,7 @@ def train(
 ) -> None:
     """Train agents, one after the other; go on where a run was killed, skip what is complete."""
     from lagros_benchmarks.cli import fail, listed
-    from lagros_benchmarks.train_settings import default_training
+    from lagros_benchmarks.training.settings import default_training
 
     try:
         names = listed(algo, str, "--algo")
@@ -129,9 +129,9 @@ def _train_one(
         ) from error
     import torch
 
-    from lagros_benchmarks.train_lessons import lesson_of
-    from lagros_benchmarks.train_run import Place
-    from lagros_benchmarks.train_run import train as train_run
+    from lagros_benchmarks.training.lessons import lesson_of
+    from lagros_benchmarks.training.run import Place
+    from lagros_benchmarks.training.run import train as train_run
 
     # One thread: networks this small gain nothing from more, and the sums stay reproducible.
     torch.set_num_threads(1)
@@ -154,7 +154,7 @@ def _write_curves(
         return written
     from lagros_benchmarks.files import write_json
     from lagros_benchmarks.surroundings import own_command
-    from lagros_benchmarks.train_curves import curves_of, draw
+    from lagros_benchmarks.training.curves import curves_of, draw
 
     curves = curves_of(records, " ".join(own_command()))
     if json is not None:

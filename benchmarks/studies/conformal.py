@@ -31,7 +31,7 @@ from lagros_benchmarks.calibration import (
     spacecraft_scores,
 )
 from lagros_benchmarks.files import write_json
-from lagros_benchmarks.worst_case_settings import CALIBRATION, VERIFICATION
+from lagros_benchmarks.worst_case.seeds import CALIBRATION, VERIFICATION
 from lagros_envs.files import write_atomic
 from lagros_policies.contraction.conformal import (
     check_coverage,

@@ -41,13 +41,13 @@ from lagros_policies.contraction import (
     verify_metric,
 )
 from lagros_policies.contraction.cvstem import CvStemSettings
-from lagros_policies.contraction.neural_design import solve_on_pool
-from lagros_policies.contraction.neural_metric import (
+from lagros_policies.contraction.neural.design import solve_on_pool
+from lagros_policies.contraction.neural.metric import (
     NeuralMetric,
     load_neural_metric,
     save_neural_metric,
 )
-from lagros_policies.contraction.neural_training import fit_network
+from lagros_policies.contraction.neural.training import fit_network
 from lagros_policies.expert import CartPoleExpert
 from lagros_policies.metric_design import MetricDesignSettings, tube_samples
 

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_benchmarks.worst_case import SearchSettings, search
+from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_envs import cartpole_task as task
 from lagros_envs.disturbances import Disturbance, into_unit_ball, onto_unit_sphere
 from lagros_envs.dynamics import hold_step, vector_field
@@ -45,7 +45,7 @@ from lagros_policies.contraction.ellipsoid_axis import (
     prove_axis_ellipsoid,
     worst_output,
 )
-from lagros_policies.contraction.prove_spacecraft import prove_axis
+from lagros_policies.contraction.proof.spacecraft import prove_axis
 from lagros_policies.contraction.tube_design import (
     ConstantTube,
     PlanBox,

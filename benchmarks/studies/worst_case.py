@@ -18,9 +18,9 @@ from rich.console import Console
 from rich.table import Table
 
 from lagros_benchmarks.files import plain, write_json
-from lagros_benchmarks.worst_case import SearchSettings
-from lagros_benchmarks.worst_case_attack import AttackSettings, run_attack
-from lagros_benchmarks.worst_case_replay import save_worst_cases
+from lagros_benchmarks.worst_case.attack import AttackSettings, run_attack
+from lagros_benchmarks.worst_case.replay import save_worst_cases
+from lagros_benchmarks.worst_case.search import SearchSettings
 from lagros_envs.files import write_atomic
 
 COMMAND = "python benchmarks/studies/worst_case.py"

@@ -34,11 +34,11 @@ from rich.console import Console
 from rich.table import Table
 from worst_case_tracking import KINDS, SEED, SPACECRAFT_BOUNDS, drawn, spacecraft_case
 
-from lagros_benchmarks import worst_case_cartpole as cartpole
 from lagros_benchmarks.files import plain, write_json
-from lagros_benchmarks.worst_case import SearchSettings, search
-from lagros_benchmarks.worst_case_certificate import TubeCheck
-from lagros_benchmarks.worst_case_settings import ATTACK
+from lagros_benchmarks.worst_case import cartpole
+from lagros_benchmarks.worst_case.certificate import TubeCheck
+from lagros_benchmarks.worst_case.search import SearchSettings, search
+from lagros_benchmarks.worst_case.seeds import ATTACK
 from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.dynamics import hold_step
 from lagros_envs.files import write_atomic

@@ -20,15 +20,15 @@ from rich.console import Console
 from rich.table import Table
 
 from lagros_benchmarks.files import write_json
-from lagros_benchmarks.worst_case import SearchSettings, search
-from lagros_benchmarks.worst_case_cartpole import (
+from lagros_benchmarks.worst_case.cartpole import (
     CartPoleTarget,
     draw_episodes,
     energy_adversary,
     policy_law,
 )
-from lagros_benchmarks.worst_case_search import OPTIMISERS
-from lagros_benchmarks.worst_case_settings import ATTACK
+from lagros_benchmarks.worst_case.optimisers import OPTIMISERS
+from lagros_benchmarks.worst_case.search import SearchSettings, search
+from lagros_benchmarks.worst_case.seeds import ATTACK
 from lagros_envs.seeding import episode_seeds
 from lagros_policies.expert import CartPoleExpert
 from lagros_policies.lagros import LagrosPolicy

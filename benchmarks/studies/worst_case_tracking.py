@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_benchmarks.worst_case_search import make_search
-from lagros_benchmarks.worst_case_settings import ATTACK
+from lagros_benchmarks.worst_case.optimisers import make_search
+from lagros_benchmarks.worst_case.seeds import ATTACK
 from lagros_envs.disturbances import Disturbance, onto_unit_sphere
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds

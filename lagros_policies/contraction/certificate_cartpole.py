@@ -20,8 +20,12 @@ from lagros_policies.contraction.certificate import Certificate, Stopwatch, Tube
 from lagros_policies.contraction.cvstem import Samples
 from lagros_policies.contraction.ellipsoid import prove_tube
 from lagros_policies.contraction.metric import Metric
-from lagros_policies.contraction.prove import ProvedBounds, prove_bounds, prove_contraction
-from lagros_policies.contraction.prove_box import ProofBox
+from lagros_policies.contraction.proof.box import ProofBox
+from lagros_policies.contraction.proof.condition import (
+    ProvedBounds,
+    prove_bounds,
+    prove_contraction,
+)
 from lagros_policies.contraction.statement import Statement
 from lagros_policies.contraction.theorems import (
     disturbed_rate,

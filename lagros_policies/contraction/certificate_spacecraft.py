@@ -19,7 +19,7 @@ from lagros_policies.contraction.ellipsoid_axis import (
     design_axis_ellipsoid,
     prove_axis_ellipsoid,
 )
-from lagros_policies.contraction.prove_spacecraft import (
+from lagros_policies.contraction.proof.spacecraft import (
     control_square,
     prove_axis,
     prove_spacecraft,

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.dynamics import CartPole, System, control_matrix, vector_field
-from lagros_policies.contraction.intervals import Interval, exact, negative_definite
 from lagros_policies.contraction.metric import Metric, Region
-from lagros_policies.contraction.prove_cells import Examined, Search, search
-from lagros_policies.contraction.prove_rates import RateCondition, Violation, rate_condition
+from lagros_policies.contraction.proof.cells import Examined, Search, search
+from lagros_policies.contraction.proof.intervals import Interval, exact, negative_definite
+from lagros_policies.contraction.proof.rates import RateCondition, Violation, rate_condition
 from lagros_policies.contraction.tube_design import ConstantTube
 
 FloatArray = NDArray[np.float64]

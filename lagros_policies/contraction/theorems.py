@@ -37,11 +37,11 @@ from lagros_envs.dynamics import (
 )
 from lagros_policies.contraction.control import contraction_terms
 from lagros_policies.contraction.cvstem import Samples
-from lagros_policies.contraction.intervals import Interval, exact, negative_definite
 from lagros_policies.contraction.metric import Metric
-from lagros_policies.contraction.prove_box import ProofBox
-from lagros_policies.contraction.prove_motion import accelerations, jacobian_parts, metric_series
-from lagros_policies.contraction.prove_series import variable
+from lagros_policies.contraction.proof.box import ProofBox
+from lagros_policies.contraction.proof.intervals import Interval, exact, negative_definite
+from lagros_policies.contraction.proof.motion import accelerations, jacobian_parts, metric_series
+from lagros_policies.contraction.proof.series import variable
 
 FloatArray = NDArray[np.float64]
 

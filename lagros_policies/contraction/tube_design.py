@@ -30,7 +30,7 @@ from scipy import sparse
 from lagros_envs.dynamics import System, control_matrix, jacobian
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.cvstem import InfeasibleError, _svec, _symmetric_basis
-from lagros_policies.contraction.prove import ProofBox
+from lagros_policies.contraction.proof.condition import ProofBox
 
 FloatArray = NDArray[np.float64]
 Method = Literal["paper", "output", "ellipsoid"]

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from lagros_benchmarks import certify, certify_evidence, cli
 from lagros_policies.contraction import load_metric, save_metric
 from lagros_policies.contraction.certificate import Certificate, TubeSizes
-from lagros_policies.contraction.prove_box import ProofBox
+from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.statement import Statement
 
 

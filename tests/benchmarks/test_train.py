@@ -19,14 +19,14 @@ import torch
 from typer.testing import CliRunner
 
 from lagros_benchmarks import train as command
-from lagros_benchmarks import train_cartpole
 from lagros_benchmarks.cli import app
 from lagros_benchmarks.sb3_vector import SB3VectorEnv
 from lagros_benchmarks.settings import BenchmarkSettings
-from lagros_benchmarks.train_curves import curves_of, draw, range_confidence
-from lagros_benchmarks.train_lessons import lesson_of
-from lagros_benchmarks.train_run import Place, train
-from lagros_benchmarks.train_settings import (
+from lagros_benchmarks.training import cartpole
+from lagros_benchmarks.training.curves import curves_of, draw, range_confidence
+from lagros_benchmarks.training.lessons import lesson_of
+from lagros_benchmarks.training.run import Place, train
+from lagros_benchmarks.training.settings import (
     CURVE,
     DEFAULTS,
     FINAL,
@@ -142,7 +142,7 @@ def test_a_run_that_was_killed_ends_with_the_same_weights(name, correction, tmp_
     training = replace(TINY, algorithm=ALGORITHMS[name], largest_correction=correction)
     whole = run(training, tmp_path / "whole")
     calls = []
-    evaluate = train_cartpole.evaluate
+    evaluate = cartpole.evaluate
 
     def killed(*arguments):
         calls.append(arguments)
@@ -150,7 +150,7 @@ def test_a_run_that_was_killed_ends_with_the_same_weights(name, correction, tmp_
             raise KeyboardInterrupt
         return evaluate(*arguments)
 
-    monkeypatch.setattr(train_cartpole, "evaluate", killed)
+    monkeypatch.setattr(cartpole, "evaluate", killed)
     folder = tmp_path / "cut"
     with pytest.raises(KeyboardInterrupt):
         run(training, folder)
@@ -171,7 +171,7 @@ def test_a_run_that_was_killed_ends_with_the_same_weights(name, correction, tmp_
 
 def test_the_folder_of_another_run_is_refused(tmp_path, monkeypatch):
     folder = tmp_path / "run"
-    monkeypatch.setattr(train_cartpole.CartPoleLesson, "final", lambda *_: pytest.fail("too far"))
+    monkeypatch.setattr(cartpole.CartPoleLesson, "final", lambda *_: pytest.fail("too far"))
     with pytest.raises(pytest.fail.Exception):
         run(TINY, folder)
     other = replace(TINY, seed=1)
@@ -200,7 +200,7 @@ def test_the_record_says_what_the_weights_depend_on(tmp_path):
     assert [row["disturbance"] for row in record["final"]] == ["none", "uniform"]
     actor = Actor.load(tmp_path / "weights.safetensors")
     assert actor.squash == "tanh"
-    figures = train_cartpole.evaluate(
+    figures = cartpole.evaluate(
         ActorPolicy(weights=actor), episode_seeds(0, 6, FINAL), "uniform", 0.75
     )
     assert figures["effort"] == pytest.approx(record["final"][1]["effort"], abs=1e-4)
@@ -213,17 +213,17 @@ def test_events_hold_the_curve_once_also_after_a_kill(tmp_path, monkeypatch):
 
     training = replace(TINY, algorithm=ALGORITHMS["td3"])
     saved = []
-    save = train_cartpole.CartPoleLesson.figures
+    save = cartpole.CartPoleLesson.figures
 
     def killed_once(lesson, model):
         figures = save(lesson, model)
         saved.append(figures)
         return figures
 
-    monkeypatch.setattr(train_cartpole.CartPoleLesson, "figures", killed_once)
-    from lagros_benchmarks import train_run
+    monkeypatch.setattr(cartpole.CartPoleLesson, "figures", killed_once)
+    from lagros_benchmarks.training import run as run_module
 
-    write = train_run._save
+    write = run_module._save
 
     def dies(path, settings, model, curve):
         if len(saved) == 2:
@@ -231,7 +231,7 @@ def test_events_hold_the_curve_once_also_after_a_kill(tmp_path, monkeypatch):
             raise KeyboardInterrupt  # after the events of the segment, before its checkpoint
         write(path, settings, model, curve)
 
-    monkeypatch.setattr(train_run, "_save", dies)
+    monkeypatch.setattr(run_module, "_save", dies)
     with pytest.raises(KeyboardInterrupt):
         run(training, tmp_path, tensorboard=True)
     record = run(training, tmp_path, tensorboard=True)
@@ -273,7 +273,7 @@ def test_a_process_that_is_killed_for_good_goes_on(tmp_path):
 def test_the_corrected_worlds_are_moved_by_both():
     settings = CartPoleSettings()
     worlds = CartPoleVectorEnv(5, "uniform", settings=settings, autoreset_mode="same_step")
-    env = train_cartpole.CorrectedWorlds(
+    env = cartpole.CorrectedWorlds(
         SB3VectorEnv(worlds), LagrosPolicy(settings), 4.0, settings.force_scale
     )
     plain = CartPoleVectorEnv(5, "uniform", settings=settings, autoreset_mode="same_step")
@@ -290,9 +290,7 @@ def test_the_corrected_worlds_are_moved_by_both():
         theirs, expected, *_ = plain.step(force / settings.force_scale)
         np.testing.assert_allclose(reward, expected, rtol=1e-4, atol=1e-4)
     with pytest.raises(RuntimeError, match="reset"):
-        train_cartpole.CorrectedWorlds(SB3VectorEnv(worlds), base, 4.0, 40.0).step_async(
-            np.zeros((5, 1))
-        )
+        cartpole.CorrectedWorlds(SB3VectorEnv(worlds), base, 4.0, 40.0).step_async(np.zeros((5, 1)))
 
 
 def test_the_figures_count_what_happens_before_the_first_fall():
@@ -309,7 +307,7 @@ def test_the_figures_count_what_happens_before_the_first_fall():
         action_clip=1.0,
         force_scale=40.0,
     )
-    figures = train_cartpole.evaluate(Never(weights=actor), episode_seeds(1, 50), "none", 0.0)
+    figures = cartpole.evaluate(Never(weights=actor), episode_seeds(1, 50), "none", 0.0)
     assert figures["fallen"] == 1.0
     assert figures["strict"] == 0.0
     assert figures["effort"] == 0.0
@@ -377,7 +375,9 @@ def test_the_command_trains_several_runs_and_draws_them(tmp_path, monkeypatch):
     assert record["command"] == "lagros train cartpole --algo td3 --seed 1 --segments 1"
     assert (tmp_path / "a.png").exists()
     # The same again: nothing is trained.
-    monkeypatch.setattr("lagros_benchmarks.train_run.make_agent", lambda *_: pytest.fail("again"))
+    monkeypatch.setattr(
+        "lagros_benchmarks.training.run.make_agent", lambda *_: pytest.fail("again")
+    )
     assert CliRunner().invoke(app, [*arguments, *out, *files]).exit_code == 0
 
 

@@ -9,11 +9,11 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 
-from lagros_benchmarks import train_spacecraft as training
 from lagros_benchmarks.sb3_vector import SB3VectorEnv
-from lagros_benchmarks.train_agent import actor_network, make_agent
-from lagros_benchmarks.train_run import Place, train
-from lagros_benchmarks.train_settings import Ppo, SpacecraftTraining
+from lagros_benchmarks.training import spacecraft as training
+from lagros_benchmarks.training.agent import actor_network, make_agent
+from lagros_benchmarks.training.run import Place, train
+from lagros_benchmarks.training.settings import Ppo, SpacecraftTraining
 from lagros_envs import spacecraft_v0
 from lagros_envs.observation import Layout
 from lagros_envs.scenarios import PRESETS, Scenario

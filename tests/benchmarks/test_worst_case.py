@@ -14,13 +14,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401
-from lagros_benchmarks import worst_case_cartpole as cartpole
-from lagros_benchmarks.worst_case import METHODS, SearchSettings, search
-from lagros_benchmarks.worst_case_attack import AttackSettings, fly_again, run_attack
-from lagros_benchmarks.worst_case_certificate import TubeCheck
-from lagros_benchmarks.worst_case_replay import load_worst_cases, replay_cartpole, save_worst_cases
-from lagros_benchmarks.worst_case_search import OPTIMISERS, make_search
-from lagros_benchmarks.worst_case_sequences import PARAMETRISATIONS, Knots, Replay, Segments
+from lagros_benchmarks.worst_case import cartpole
+from lagros_benchmarks.worst_case.attack import AttackSettings, fly_again, run_attack
+from lagros_benchmarks.worst_case.certificate import TubeCheck
+from lagros_benchmarks.worst_case.optimisers import OPTIMISERS, make_search
+from lagros_benchmarks.worst_case.replay import (
+    load_worst_cases,
+    replay_cartpole,
+    save_worst_cases,
+)
+from lagros_benchmarks.worst_case.search import METHODS, SearchSettings, search
+from lagros_benchmarks.worst_case.sequences import PARAMETRISATIONS, Knots, Replay, Segments
 from lagros_envs.cartpole_vector import CartPoleVectorEnv
 from lagros_envs.seeding import episode_seeds
 from lagros_policies.baselines import LqrPolicy

@@ -9,9 +9,9 @@ import pytest
 
 import lagros_policies
 from lagros_benchmarks import calibration
-from lagros_benchmarks.worst_case_replay import replay_spacecraft
-from lagros_benchmarks.worst_case_settings import ATTACK, CALIBRATION, VERIFICATION
-from lagros_benchmarks.worst_case_spacecraft import (
+from lagros_benchmarks.worst_case.replay import replay_spacecraft
+from lagros_benchmarks.worst_case.seeds import ATTACK, CALIBRATION, VERIFICATION
+from lagros_benchmarks.worst_case.spacecraft import (
     PARAMETERS,
     Adversary,
     PlansOnce,

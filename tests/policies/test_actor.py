@@ -10,7 +10,7 @@ from stable_baselines3 import A2C, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
 from lagros_benchmarks.sb3_vector import LinearFeatures, SB3VectorEnv
-from lagros_benchmarks.train_cartpole import evaluate, extract_actor
+from lagros_benchmarks.training.cartpole import evaluate, extract_actor
 from lagros_envs.cartpole import CartPoleEnv
 from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.cartpole_vector import CartPoleVectorEnv

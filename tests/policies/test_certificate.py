@@ -16,7 +16,7 @@ from lagros_policies.contraction.certificate_cartpole import (
 )
 from lagros_policies.contraction.certificate_spacecraft import spacecraft_certificate
 from lagros_policies.contraction.double_integrator import design_axis
-from lagros_policies.contraction.prove_box import ProofBox
+from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.statement import Statement
 
 BOX = ProofBox(0.06, 0.3, 0.3, 0.3, angle_error=0.03, angular_rate_error=0.1)

@@ -20,14 +20,14 @@ from lagros_policies.contraction import (
     robust_control,
     verify_metric,
 )
-from lagros_policies.contraction.neural_design import hats, solve_at_angles, solve_on_pool
-from lagros_policies.contraction.neural_metric import (
+from lagros_policies.contraction.neural.design import hats, solve_at_angles, solve_on_pool
+from lagros_policies.contraction.neural.metric import (
     OUTPUTS,
     NeuralMetric,
     load_neural_metric,
     save_neural_metric,
 )
-from lagros_policies.contraction.neural_training import NeuralTrainingSettings, fit_network
+from lagros_policies.contraction.neural.training import NeuralTrainingSettings, fit_network
 from lagros_policies.imitation.networks import Mlp
 from lagros_policies.metric_design import MetricDesignSettings, tube_samples
 

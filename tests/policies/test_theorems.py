@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lagros_policies.contraction import Samples
-from lagros_policies.contraction.prove_box import ProofBox
+from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.theorems import (
     contraction_distance,
     disturbed_rate,

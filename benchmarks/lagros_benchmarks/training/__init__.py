@@ -1,0 +1,1 @@
+"""Reinforcement learning of our tasks: settings, resumable runs, lessons and learning curves."""

@@ -1,0 +1,161 @@
+"""Learning curves of several seeds: the median with an interval, as JSON and as a figure.
+
+The median of independent runs lies between the least and the largest of n of them with confidence
+1 - 2^(1 - n), whatever their distribution: 93.75 % for five.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lagros_benchmarks.canvas import canvas, caption, check_figure_path, curve, save, styles
+from lagros_benchmarks.surroundings import machine, versions
+
+# What is drawn of each task: name in the curves, title, factor.
+_PANELS: dict[str, tuple[tuple[str, str, float], ...]] = {
+    "cartpole": (
+        ("success", "success [%]", 100.0),
+        ("strict", "strict success [%]", 100.0),
+        ("effort", "effort [N² s]", 1.0),
+    ),
+    "spacecraft": (
+        ("success", "success [%]", 100.0),
+        ("strict_success", "strict success [%]", 100.0),
+        ("collided", "collided [%]", 100.0),
+    ),
+}
+_AXES = ("steps", "seconds", "cpu_seconds")
+
+
+def range_confidence(runs: int) -> float:
+    """Return the confidence that the range of so many runs holds the median of all.
+
+    Raises:
+        ValueError: There is no run.
+    """
+    if runs < 1:
+        raise ValueError(f"runs={runs!r} must be at least 1")
+    return float(1.0 - 2.0 ** (1 - runs))
+
+
+def curves_of(records: Sequence[dict[str, Any]], command: str) -> dict[str, Any]:
+    """Put the records of runs together, those that differ in the seed alone in one curve.
+
+    Args:
+        records: As `run.train` returns them, of one task.
+        command: What prints the curves again.
+
+    Returns:
+        One entry per algorithm, JSON-serialisable: the figures after every segment with median,
+        least and largest over the seeds, and those at the end of each seed.
+
+    Raises:
+        ValueError: There is no record, or they are of several tasks.
+    """
+    tasks = {record["training"]["task"] for record in records}
+    if len(tasks) != 1:
+        raise ValueError(f"curves are of one task, not of {sorted(tasks)}")
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for record in records:
+        groups.setdefault(_label(record["training"]), []).append(record)
+    return {
+        "command": command,
+        "task": tasks.pop(),
+        "interval": "median of the seeds, least and largest of them",
+        "curves": [_curve(label, group) for label, group in groups.items()],
+        "machine": machine(),
+        "versions": versions(),
+    }
+
+
+def _label(training: dict[str, Any]) -> str:
+    correction = training.get("largest_correction")
+    name = str(training["algorithm"]["name"])
+    return name if correction is None else f"residual, {correction:g} N ({name})"
+
+
+def _curve(label: str, group: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    shared = [{**record["training"], "seed": None} for record in group]
+    if any(settings != shared[0] for settings in shared):
+        raise ValueError(f"the runs of {label} differ in more than the seed")
+    names = [name for name in group[0]["curve"] if name not in _AXES]
+    return {
+        "label": label,
+        "training": shared[0],
+        "seeds": [record["training"]["seed"] for record in group],
+        "confidence_of_range": range_confidence(len(group)),
+        "steps": group[0]["curve"]["steps"],
+        "figures": {name: _spread([record["curve"][name] for record in group]) for name in names},
+        "seconds": [record["curve"]["seconds"][-1] for record in group],
+        "cpu_seconds": [record["curve"]["cpu_seconds"][-1] for record in group],
+        "final": [record["final"] for record in group],
+    }
+
+
+def _spread(curves: Sequence[Sequence[float]]) -> dict[str, Any]:
+    values = np.asarray(curves, dtype=np.float64)
+    return {
+        "median": np.median(values, axis=0).round(6).tolist(),
+        "least": values.min(axis=0).tolist(),
+        "largest": values.max(axis=0).tolist(),
+        "of_seeds": values.tolist(),
+    }
+
+
+def draw(curves: dict[str, Any], path: str | Path) -> Path:
+    """Draw the curves of `curves_of`: lines are medians, bands the range of the seeds.
+
+    Args:
+        curves: The curves.
+        path: The figure, .png, .pdf or .svg.
+
+    Returns:
+        The path.
+    """
+    path = check_figure_path(path)
+    panels = _PANELS[curves["task"]]
+    figure, axes = canvas(6.0, 0.6 + 2.0 * len(panels), len(panels), 1, share="row")
+    for panel, (name, title, factor) in zip(axes, panels, strict=True):
+        looks = styles([group["label"] for group in curves["curves"]])
+        for group in curves["curves"]:
+            spread, style = group["figures"][name], looks[group["label"]]
+            steps = 1e-3 * curve(group["steps"])
+            low, middle, high = (
+                factor * curve(spread[part]) for part in ("least", "median", "largest")
+            )
+            panel.fill_between(steps, low, high, color=style.colour, alpha=0.2, linewidth=0)
+            panel.plot(
+                steps,
+                middle,
+                color=style.colour,
+                linestyle=style.line,
+                linewidth=1.8,
+                label=group["label"],
+            )
+        panel.set_title(title, loc="left", fontsize=10)
+        if factor == 100.0:
+            panel.set_ylim(-4.0, 104.0)
+    handles, names = axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles, names, loc="outside upper left", ncols=4, frameon=False, handlelength=3.5
+    )
+    caption(figure, _caption(curves))
+    return save(figure, path)
+
+
+def _caption(curves: dict[str, Any]) -> str:
+    groups = curves["curves"]
+    unit = "control steps" if curves["task"] == "cartpole" else "control steps of all agents"
+    against = f"against thousands of {unit} of training"
+    counts = sorted({len(group["seeds"]) for group in groups})
+    if counts == [1]:
+        return f"{against}; one seed each, so that there is no interval"
+    confidence = min(group["confidence_of_range"] for group in groups)
+    return (
+        f"{against}; lines: median of {', '.join(map(str, counts))} seeds;\n"
+        f"bands: their range, which holds the median of all seeds with {confidence:.1%}"
+    )

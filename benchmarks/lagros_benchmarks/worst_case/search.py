@@ -1,0 +1,265 @@
+"""Search for the bounded disturbance that a policy stands worst.
+
+A target flies any number of sequences of any of its episodes in one batch and says how bad each
+flight was. Every method spends the same currency, flights per episode, and all episodes are
+searched side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_benchmarks.worst_case.optimisers import OPTIMISERS, make_search
+from lagros_benchmarks.worst_case.sequences import PARAMETRISATIONS, Parametrisation
+from lagros_envs.disturbances import into_unit_ball, onto_unit_sphere
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+METHODS = (*OPTIMISERS, "gradient", "hybrid")
+# Shares of the way to the pushes that the slopes ask for, tried side by side.
+_WAYS = (1.0, 0.5, 0.2, 0.05)
+# Further starts of a climb: a direction of the episode with some noise per step.
+_START_NOISE = 0.3
+# Share of the budget at which "hybrid" stops to explore and climbs.
+_EXPLORED = 0.5
+
+
+class Target(Protocol):
+    """What is attacked: episodes of one policy under one bound, with one goal."""
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+
+    @property
+    def steps(self) -> int:
+        """Control steps of an episode."""
+
+    @property
+    def channels(self) -> int:
+        """Coordinates of d."""
+
+    @property
+    def slope_cost(self) -> int:
+        """Flights that the slopes of one flight cost; 0 if there are none."""
+
+    def scores(self, episode: IntArray, sequences: FloatArray) -> FloatArray:
+        """Return how bad the flights (b,) under d/d_bar (b, steps, channels) are; more is worse."""
+
+    def slopes(self, episode: IntArray, sequences: FloatArray) -> FloatArray:
+        """Return the slopes of the scores by the sequences, of their shape, up to a factor."""
+
+    def starts(self) -> FloatArray:
+        """Return sequences worth trying first, shape (episodes, k, steps, channels)."""
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How to search.
+
+    Attributes:
+        method: One of `METHODS`; "hybrid" lets an optimiser explore and climbs from its best.
+        optimiser: What explores in "hybrid".
+        parametrisation: One of `PARAMETRISATIONS`.
+        pieces: Its pieces.
+        budget: Flights per episode.
+        population: Flights per question of an optimiser.
+        restarts: Sequences that climb side by side.
+
+    Raises:
+        ValueError: A name is unknown or a number is out of range.
+    """
+
+    method: str = "hybrid"
+    optimiser: str = "cross-entropy"
+    parametrisation: str = "switching"
+    pieces: int = 6
+    budget: int = 1000
+    population: int = 30
+    restarts: int = 8
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        for name, valid in (
+            ("method", METHODS),
+            ("optimiser", OPTIMISERS),
+            ("parametrisation", tuple(PARAMETRISATIONS)),
+        ):
+            if getattr(self, name) not in valid:
+                raise ValueError(
+                    f"{name}={getattr(self, name)!r} must be one of {', '.join(valid)}"
+                )
+        for name, least in (("pieces", 1), ("budget", 1), ("population", 2), ("restarts", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}={getattr(self, name)!r} must be at least {least}")
+
+
+@dataclass(frozen=True)
+class Found:
+    """The worst sequence that a search found for one episode.
+
+    Attributes:
+        sequence: d/d_bar, shape (steps, channels).
+        score: How bad its flight was in the search.
+        flights: Flights spent on the episode.
+    """
+
+    sequence: FloatArray
+    score: float
+    flights: int
+
+
+@dataclass
+class _Pool:
+    """The best sequences so far of every episode, best first, and what they cost."""
+
+    size: int
+    sequences: list[FloatArray]
+    scores: list[FloatArray]
+    flights: int = 0
+
+    @classmethod
+    def empty(cls, target: Target, size: int) -> _Pool:
+        shape = (0, target.steps, target.channels)
+        return cls(
+            size,
+            [np.empty(shape) for _ in range(target.episodes)],
+            [np.empty(0) for _ in range(target.episodes)],
+        )
+
+    def add(self, sequences: FloatArray, scores: FloatArray) -> None:
+        """Take sequences (episodes, k, steps, channels) with their scores (episodes, k)."""
+        self.flights += scores.shape[1]
+        for index, (fresh, values) in enumerate(zip(sequences, scores, strict=True)):
+            joined = np.concatenate([self.scores[index], values])
+            best = np.argsort(-joined, kind="stable")[: self.size]
+            self.scores[index] = joined[best]
+            self.sequences[index] = np.concatenate([self.sequences[index], fresh])[best]
+
+
+def search(target: Target, settings: SearchSettings, seed: int = 0) -> list[Found]:
+    """Search the worst sequence of every episode of a target.
+
+    Args:
+        target: What is attacked.
+        settings: How.
+        seed: Seed of the search; episodes draw independently.
+
+    Returns:
+        One result per episode.
+
+    Raises:
+        ValueError: The method is "gradient" and the target has no slopes.
+    """
+    climbs = settings.method in ("gradient", "hybrid") and target.slope_cost > 0
+    if settings.method == "gradient" and not climbs:
+        raise ValueError("method='gradient' needs a target with slopes; use 'hybrid'")
+    children = np.random.SeedSequence(seed).spawn(target.episodes)
+    streams = [np.random.default_rng(child) for child in children]
+    pool = _Pool.empty(target, settings.restarts)
+    _try(target, pool, target.starts())
+    if settings.method == "gradient":
+        _try(target, pool, _random_starts(target, settings.restarts, streams))
+    else:
+        name = settings.optimiser if settings.method == "hybrid" else settings.method
+        share = _EXPLORED if climbs else 1.0
+        _explore(target, settings, name, pool, streams, share * settings.budget)
+    if climbs:
+        _climb(target, pool, settings.budget)
+    return [
+        Found(sequences[0], float(scores[0]), pool.flights)
+        for sequences, scores in zip(pool.sequences, pool.scores, strict=True)
+    ]
+
+
+def fly_all(target: Target, sequences: FloatArray) -> FloatArray:
+    """Return the scores (episodes, k) of sequences (episodes, k, steps, channels), in one batch."""
+    count, each = sequences.shape[:2]
+    episode = np.repeat(np.arange(count), each)
+    flat = sequences.reshape(count * each, *sequences.shape[2:])
+    return target.scores(episode, flat).reshape(count, each)
+
+
+def _try(target: Target, pool: _Pool, sequences: FloatArray) -> None:
+    if sequences.shape[1]:
+        pool.add(sequences, fly_all(target, sequences))
+
+
+def _explore(
+    target: Target,
+    settings: SearchSettings,
+    name: str,
+    pool: _Pool,
+    streams: Sequence[np.random.Generator],
+    budget: float,
+) -> None:
+    """Let one optimiser per episode ask, until the budget is spent."""
+    kind: Parametrisation = PARAMETRISATIONS[settings.parametrisation](
+        target.steps, target.channels, settings.pieces
+    )
+    searches = [make_search(name, kind.dimension, settings.population, rng) for rng in streams]
+    while pool.flights + settings.population <= budget:
+        points = [one.ask() for one in searches]
+        sequences = np.stack([kind.sequences(asked) for asked in points])
+        scores = fly_all(target, sequences)
+        pool.add(sequences, scores)
+        for one, asked, values in zip(searches, points, scores, strict=True):
+            one.tell(asked, values)
+
+
+def _random_starts(
+    target: Target, count: int, streams: Sequence[np.random.Generator]
+) -> FloatArray:
+    shape = (count, target.steps, target.channels)
+    rays = []
+    for rng in streams:
+        direction = rng.standard_normal((count, 1, target.channels))
+        rays.append(direction + _START_NOISE * rng.standard_normal(shape))
+    return into_unit_ball(np.stack(rays) / _START_NOISE)
+
+
+def _climb(target: Target, pool: _Pool, budget: int) -> None:
+    """Move the best sequences of every episode along their slopes, until nothing is gained.
+
+    A linear function on a product of balls is largest where every push has length one and lies
+    along its slope; the next sequences lie between the present ones and that (conditional
+    gradient), so that they never leave the balls.
+    """
+    ways = np.array(_WAYS)
+    while True:
+        count = min(len(values) for values in pool.scores)
+        cost = count * (target.slope_cost + len(ways))
+        if count == 0 or pool.flights + cost > budget:
+            return
+        before = np.stack([values[:count] for values in pool.scores])
+        here = np.stack([sequences[:count] for sequences in pool.sequences])
+        flat = here.reshape(-1, target.steps, target.channels)
+        slopes = target.slopes(np.repeat(np.arange(target.episodes), count), flat)
+        # A push without influence stays as it is.
+        rays = onto_unit_sphere(slopes, flat).reshape(here.shape)
+        shares = ways[:, None, None]
+        between = (1.0 - shares) * here[:, :, None] + shares * rays[:, :, None]
+        moved = into_unit_ball(between.reshape(target.episodes, -1, target.steps, target.channels))
+        scores = fly_all(target, moved)
+        # Every climber keeps its best, so that one does not crowd out the others.
+        each = scores.reshape(target.episodes, count, len(ways))
+        best = np.argmax(each, axis=2)
+        rows, columns = np.ogrid[: target.episodes, :count]
+        chosen = moved.reshape(*each.shape, target.steps, target.channels)[rows, columns, best]
+        gained = each[rows, columns, best] > before + 1e-9
+        pool.flights += cost
+        for index in range(target.episodes):
+            kept = np.where(gained[index][:, None, None], chosen[index], here[index])
+            values = np.where(
+                gained[index], each[index, np.arange(count), best[index]], before[index]
+            )
+            order = np.argsort(-values, kind="stable")
+            pool.sequences[index], pool.scores[index] = kept[order], values[order]
+        if not gained.any():
+            return

@@ -1,0 +1,1 @@
+"""Contraction proved on continuous sets: interval arithmetic, cells, and exact fractions."""
