@@ -96,8 +96,16 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
                 f"{self.metadata['render_modes']} or None"
             )
         self.settings = settings or task.CartPoleSettings()
-        self._hold = HeldStep(self.settings.system, self.settings.control_period, compiled)
+        self._hold = HeldStep(
+            self.settings.system,
+            self.settings.control_period,
+            compiled,
+            measure=task.StepMeasure(self.settings),
+            given=task.STATE_DIM,
+        )
         self._steps = self.settings.steps
+        # r(t) at every control instant.
+        self._radii: list[float] = [self._radius(step) for step in range(self._steps + 1)]
         self.disturbance = Disturbance(
             disturbance, disturbance_bound, channel_mask(disturbance_channels, task.RATES), metric
         )
@@ -154,7 +162,7 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._success_time = math.inf
         self._push = np.zeros(task.STATE_DIM)
         self._started = True
-        arrival = self._note_arrival(fallen=False)
+        arrival = self._note_arrival(self._goal_distance(), fallen=False)
         if self.render_mode == "human":
             self.render()
         return self._observation(), self._info(arrival, fallen=False)
@@ -176,17 +184,16 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         if not self._started:
             raise RuntimeError("call reset() before step()")
-        settings = self.settings
         force = self._force(action)
         self._push = self._current_push()
-        integrated = self._advance(force)
+        integrated, distance, effort, reward = self._advance(force)
         self._step += 1
-        effort = force * force * settings.control_period
         self._effort += effort
         fallen = not integrated or abs(self._state[1]) > task.FALL_ANGLE
-        arrival = self._note_arrival(fallen)
-        distance, _, _, first_success = arrival
-        reward: float = task.reward(settings, effort, distance, first_success, fallen)
+        arrival = self._note_arrival(distance, fallen)
+        first_success = arrival[-1]
+        if fallen or first_success:
+            reward = task.reward(self.settings, effort, distance, first_success, fallen)
         if self.render_mode == "human":
             self.render()
         truncated = self._step >= self._steps
@@ -237,55 +244,69 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         values = np.asarray(action)
         if values.shape != (1,):
             raise ValueError(f"action has shape {values.shape}; it must be one number, shape (1,)")
-        value = float(values.item())
+        value = values.item()
         if not math.isfinite(value):
             raise ValueError(f"action={value!r} is not finite")
         force: float = task.applied_force(self.settings, value, _clip)
         return force
 
-    def _advance(self, force: float) -> bool:
-        """Move the state over one control step, and tell whether it could be integrated."""
+    def _advance(self, force: float) -> tuple[bool, float, float, float]:
+        """Move the state over one control step.
+
+        Returns:
+            Whether it could be integrated, ||x - x_f||, ||u||^2 dt, and the reward of a step
+            without a fall or a success.
+        """
+        # By name: starred arguments would go through a list and a tuple.
+        x0, x1, x2, x3 = self._state
+        d0, d1, d2, d3 = self._push.tolist()
+        g0, g1, g2, g3 = self._goal
         try:
-            following = self._hold.run(*self._state, force, *self._push.tolist())
+            p, angle, velocity, rate, distance, effort, reward = self._hold.run(
+                x0, x1, x2, x3, force, d0, d1, d2, d3, g0, g1, g2, g3
+            )
         except (OverflowError, ValueError):  # an infinity has no sine
-            return False
-        p, angle, velocity, rate = following
-        largest = task.LARGEST_STATE
-        # A comparison with nan is false.
-        if (
-            -largest <= p <= largest
-            and -largest <= angle <= largest
-            and -largest <= velocity <= largest
-            and -largest <= rate <= largest
-        ):
-            self._state = following
-            return True
-        return False
+            pass
+        else:
+            # A comparison with nan is false.
+            if distance <= task.LARGEST_DISTANCE:
+                self._state = p, angle, velocity, rate
+                return True, distance, effort, reward
+        effort = force * force * self.settings.control_period
+        return False, self._goal_distance(), effort, 0.0
+
+    def _goal_distance(self) -> float:
+        distance: float = task.goal_distance(self._state, self._goal, math.sqrt)
+        return distance
+
+    def _radius(self, step: int) -> float:
+        radius: float = self.settings.tube.radius(step * self.settings.control_period)
+        return radius
 
     def _current_push(self) -> FloatArray:
         # Past the time limit (a caller who ignored `truncated`) the last push stays.
         index = self._step if self._step < self._steps else self._steps - 1
+        drawn: FloatArray = self._pushes[index]
         if not self._feedback:
-            return cast(FloatArray, self._pushes[index])
+            return drawn
         nominal = None if self.nominal is None else self.nominal[self._nominal_index()]
         return self.disturbance.respond(
-            Situation(self.state, nominal, np.asarray(self.time), self._pushes[index])
+            Situation(self.state, nominal, np.asarray(self.time), drawn)
         )
 
     def _nominal_index(self) -> int:
         return min(self._step, self._steps)
 
-    def _note_arrival(self, fallen: bool) -> tuple[float, float, bool, bool]:
+    def _note_arrival(self, distance: float, fallen: bool) -> tuple[float, float, bool, bool]:
         """Return ||x - x_f||, r(t), whether x is inside the tube and whether for the first time."""
-        distance: float = task.goal_distance(self._state, self._goal, math.sqrt)
-        time = self._step * self.settings.control_period
-        radius: float = self.settings.tube.radius(time)
+        step = self._step
+        radius = self._radii[step] if step <= self._steps else self._radius(step)
         inside = not fallen and distance <= radius
         if self._success_time != math.inf:
             return distance, radius, inside, False
         self._effort_to_success = self._effort
         if inside:
-            self._success_time = time
+            self._success_time = step * self.settings.control_period
         return distance, radius, inside, inside
 
     def _observation(self) -> NDArray[np.float32]:

@@ -23,8 +23,8 @@ FloatArray = NDArray[np.float64]
 STATE_DIM = 4
 RATES = (False, False, True, True)
 FALL_ANGLE = math.pi / 2  # [rad]
-# Beyond this, in units of the state, the integration has diverged under an enormous force.
-LARGEST_STATE = 1e12
+# Farther from its goal than this the integration has diverged under an enormous force.
+LARGEST_DISTANCE = 1e12
 # Where each named part of the observation lies.
 STATE = slice(0, 4)
 GOAL = slice(4, 8)

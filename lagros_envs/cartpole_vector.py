@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 from gymnasium import spaces
@@ -104,6 +104,11 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         self._open = np.ones(worlds, dtype=bool)
         self._fallen = np.zeros(worlds, dtype=bool)
         self._worlds = np.arange(worlds)
+        self._first_push = self._worlds * self._steps
+        # t and r(t) at every control instant.
+        instants = np.arange(self._steps + 1)
+        self._times: FloatArray = np.multiply(instants, self.settings.control_period)
+        self._radii: FloatArray = self.settings.tube.radius(self._times)
         # What stays the same in every observation of an episode: goal and initial state.
         self._blank = np.zeros((worlds, task.OBSERVATION_DIM), np.float32)
         self.nominal: FloatArray | None = None
@@ -223,17 +228,14 @@ class CartPoleVectorEnv(RestartingVectorEnv):
             ||u||^2 dt of the step, and its reward where nothing happened.
         """
         push = self._current_push()
-        with np.errstate(over="ignore", invalid="ignore"):
-            following = self._hold(self._state, [force], push.T, self._goal)
-            size = np.abs(following)
+        following = self._hold(self._state, [force], push.T, self._goal)
         self._distance, effort, rewards = self._hold.measured.copy()
         self._effort += effort
         self._step += 1
-        fallen = size[1] > task.FALL_ANGLE
-        # Comparing with nan gives False: a world that could not be integrated stays and has fallen.
-        within = size <= task.LARGEST_STATE
+        # A comparison with nan gives False: what could not be integrated stays and has fallen.
+        within = self._distance <= task.LARGEST_DISTANCE
         if restarting is not None or np.count_nonzero(within) < within.size:
-            lost = ~np.all(within, axis=0)
+            lost = ~within
             if restarting is not None:
                 lost &= ~restarting
                 push[restarting] = 0.0
@@ -241,20 +243,22 @@ class CartPoleVectorEnv(RestartingVectorEnv):
             kept = lost if restarting is None else lost | restarting
             following[:, kept] = self._state[:, kept]
             self._measure_distance(kept)
-            fallen = lost | (np.abs(following[1]) > task.FALL_ANGLE)
+            self._fallen = lost | (np.abs(following[1]) > task.FALL_ANGLE)
+        else:
+            self._fallen = np.abs(following[1]) > task.FALL_ANGLE
         self._state[:] = following
-        self._push, self._fallen = push, fallen
+        self._push = push
         return effort, rewards
 
     def _current_push(self) -> FloatArray:
         """Return d of this step, a new array (worlds, 4)."""
         # Past the time limit (a caller who ignored `truncated`) the last push stays.
         place = np.minimum(self._step, self._steps - 1)
-        place += self._worlds * self._steps
+        place += self._first_push
         push = self._pushes.reshape(-1, task.STATE_DIM).take(place, axis=0)
         if not self.disturbance.is_feedback:
             return push
-        situation = Situation(self.state, self._nominal_now(), self._time(), push)
+        situation = Situation(self.state, self._nominal_now(), self._clock()[0], push)
         # A copy: a callable may return an array that it keeps.
         return self.disturbance.respond(situation).copy()
 
@@ -273,8 +277,14 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         force: FloatArray = task.applied_force(self.settings, values, np.clip)
         return force
 
-    def _time(self) -> FloatArray:
-        return cast(FloatArray, self._step * self.settings.control_period)
+    def _clock(self) -> tuple[FloatArray, FloatArray]:
+        """Return t [s] and r(t) of every world."""
+        if not np.count_nonzero(self._step > self._steps):
+            return self._times.take(self._step), self._radii.take(self._step)
+        # A caller who ignored `truncated`.
+        times: FloatArray = np.multiply(self._step, self.settings.control_period)
+        radii: FloatArray = self.settings.tube.radius(times)
+        return times, radii
 
     def _nominal_now(self) -> FloatArray | None:
         if self.nominal is None:
@@ -283,8 +293,7 @@ class CartPoleVectorEnv(RestartingVectorEnv):
 
     def _note_arrivals(self) -> BoolArray:
         """Note who is inside the tube, and return which worlds have their first success."""
-        self._now = self._time()
-        self._radius: FloatArray = self.settings.tube.radius(self._now)
+        self._now, self._radius = self._clock()
         self._inside = self._distance <= self._radius
         self._inside &= ~self._fallen
         np.copyto(self._effort_to_success, self._effort, where=self._open)
@@ -301,15 +310,16 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         return observation
 
     def _info(self) -> dict[str, Any]:
+        # Copies of what a restart writes to; the others are made anew in every step.
         info = {
             "success": ~self._open,
             "success_time": self._success_time.copy(),
-            "inside_tube": self._inside.copy(),
+            "inside_tube": self._inside,
             "fallen": self._fallen.copy(),
             "effort": self._effort.copy(),
             "effort_to_success": self._effort_to_success.copy(),
             "disturbance": self._push.copy(),
-            "tube_radius": self._radius.copy(),
+            "tube_radius": self._radius,
             "goal_distance": self._distance.copy(),
         }
         nominal = self._nominal_now()

@@ -77,6 +77,9 @@ class SpacecraftWorld:
         self.obstacle_centres = np.zeros((2, worlds, obstacles))
         # An absent obstacle has the radius -inf, so that nothing touches or senses it.
         self.obstacle_radii = np.full((worlds, obstacles), -np.inf)
+        # The same for every agent, obstacles first: operations on them run over all rows at once.
+        self.centres_by_agent = np.zeros((2, obstacles, *shape))
+        self.radii_by_agent = np.full((obstacles, *shape), -np.inf)
         self.agent_radius = np.zeros(worlds)
         self.core_radius = np.zeros(worlds)
         self.scenarios: list[Scenario | None] = [None] * worlds
@@ -145,6 +148,8 @@ class SpacecraftWorld:
             self.obstacle_centres[:, world, :count] = scenario.obstacles.T
             self.obstacle_radii[world] = -np.inf
             self.obstacle_radii[world, :count] = scenario.obstacle_radii
+            self.centres_by_agent[:, :, world] = self.obstacle_centres[:, world, :, None]
+            self.radii_by_agent[:, world] = self.obstacle_radii[world, :, None]
             self.agent_radius[world] = scenario.agent_radius
             self.core_radius[world] = scenario.core
             self.scenarios[world] = scenario
@@ -189,7 +194,9 @@ class SpacecraftWorld:
         self.effort += effort
         self.step_count = self.step_count + going
         hit = swept_agents(path, 2.0 * self.agent_radius)
-        hit |= swept_obstacles(path, self.obstacle_centres, self._reach())
+        # The distance of centres at which agent and obstacle touch.
+        contact = self.radii_by_agent + self.core_radius[:, None]
+        hit |= swept_obstacles(path, self.centres_by_agent, contact)
         hit |= ~integrated
         hit &= going[:, None]
         first_collision = hit & ~self.collided
@@ -254,10 +261,6 @@ class SpacecraftWorld:
                 f"most {self.obstacles}: build it with preset=dataclasses.replace(PRESETS[...], "
                 f"obstacle_count=(0, {len(scenario.obstacles)}))"
             )
-
-    def _reach(self) -> FloatArray:
-        """Return the distance of centres at which agent and obstacle touch, (worlds, obstacles)."""
-        return self.obstacle_radii + self.core_radius[:, None]
 
     def _current_push(self) -> FloatArray:
         """Return d of this step, a new array (6, worlds, agents)."""

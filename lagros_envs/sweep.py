@@ -73,9 +73,10 @@ def swept_obstacles(path: Path, centres: FloatArray, contact: FloatArray) -> Boo
 
     Args:
         path: How the agents moved.
-        centres: Of the obstacles, shape (2, worlds, obstacles) [m].
-        contact: Distance of centres at which an agent touches, shape (worlds, obstacles) [m];
-            negative where there is no obstacle.
+        centres: Of the obstacles, the same for all agents of a world, shape (2, obstacles, worlds,
+            agents) [m].
+        contact: Distance of centres at which an agent touches, shape (obstacles, worlds, agents)
+            [m]; negative where there is no obstacle.
 
     Returns:
         Shape (worlds, agents).
@@ -83,19 +84,19 @@ def swept_obstacles(path: Path, centres: FloatArray, contact: FloatArray) -> Boo
     points, bulge, reach = path
     hit = np.zeros(bulge.shape, bool)
     x, y = points[-1]
-    square = x[:, :, None] - centres[0, :, None]
+    square = x - centres[0]
     square *= square
-    offset = y[:, :, None] - centres[1, :, None]
+    offset = y - centres[1]
     offset *= offset
     square += offset
     # An absent obstacle has the contact -inf; its square must not count.
-    limit = np.add(reach[:, :, None], contact[:, None], out=offset)
+    limit = np.add(reach, contact, out=offset)
     np.maximum(limit, 0.0, out=limit)
     limit *= limit
-    world, agent, obstacle = np.nonzero(square <= limit)
+    obstacle, world, agent = np.nonzero(square <= limit)
     if world.size:
-        offsets = points[:, :, world, agent] - centres[:, world, obstacle]
-        met = closest_approach(offsets) < contact[world, obstacle] + bulge[world, agent]
+        offsets = points[:, :, world, agent] - centres[:, obstacle, world, agent]
+        met = closest_approach(offsets) < contact[obstacle, world, agent] + bulge[world, agent]
         hit[world[met], agent[met]] = True
     return hit
 

@@ -14,12 +14,14 @@ from lagros_envs.dynamics.straight_line import (
     ArrayFunction,
     Measure,
     recorded_hold,
+    recorded_measure,
     scalar_source,
 )
 from lagros_envs.dynamics.system import System
 
 FloatArray = NDArray[np.float64]
-# From the parts of x, u and d, as floats, to those of x at the end of the step.
+# From the parts of x, u, d and what is given, as floats, to those of x at the end and what is
+# measured there.
 FloatStep = Callable[..., tuple[float, ...]]
 
 
@@ -30,19 +32,31 @@ class HeldStep:
         system: The system.
         duration: Length of the control step [s].
         compiled: Whether numba compiles it.
+        measure: Computes more from the state at the end, see `straight_line.recorded_hold`.
+        given: How many numbers the measure is given.
 
     Attributes:
-        run: From the n parts of x, the m of u and the n of d to the n of x at the end. It raises
-            ValueError for the sine of an infinity, or returns nan where it is compiled.
+        run: From the n parts of x, the m of u, the n of d and what is given to the n of x at the
+            end and what the measure computed. It raises ValueError for the sine of an infinity, or
+            returns nan where it is compiled.
 
     Raises:
         ImportError: `compiled` was asked for and numba is not installed.
     """
 
-    def __init__(self, system: System, duration: float, compiled: bool = False) -> None:
+    def __init__(
+        self,
+        system: System,
+        duration: float,
+        compiled: bool = False,
+        measure: Measure | None = None,
+        given: int = 0,
+    ) -> None:
         """Record the step."""
-        self._made_from = system, duration, compiled
-        self.run: FloatStep = _float_step(cast(Hashable, system), duration, compiled)
+        self._made_from = system, duration, compiled, measure, given
+        self.run: FloatStep = _float_step(
+            cast(Hashable, system), duration, compiled, cast(Hashable, measure), given
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what the step is made from: a recorded function has no name to be found by."""
@@ -95,7 +109,9 @@ class HeldBatch:
         else:
             step = recorded_hold(system, duration, substeps, measure=measure, given=given)
             function = ArrayFunction(step, shape)
-            self._run, self._inputs = function, function.inputs
+            # An enormous force overflows; the environments look at what comes out.
+            self._run = np.errstate(over="ignore", invalid="ignore")(function)
+            self._inputs = function.inputs
             self._states, self.measured = function.outputs[:n], function.outputs[n:]
 
     def __call__(
@@ -138,8 +154,11 @@ class HeldBatch:
 
 
 @lru_cache(maxsize=32)
-def _float_step(system: Any, duration: float, compiled: bool) -> FloatStep:
-    source = scalar_source(recorded_hold(system, duration / SUBSTEPS, 1), SUBSTEPS)
+def _float_step(
+    system: Any, duration: float, compiled: bool, measure: Any, given: int
+) -> FloatStep:
+    tail = None if measure is None else recorded_measure(system, measure, given)
+    source = scalar_source(recorded_hold(system, duration / SUBSTEPS, 1), SUBSTEPS, tail)
     if compiled:
         from lagros_envs.dynamics.compiled import compiled_function
 

@@ -228,27 +228,53 @@ def recorded_hold(
     return straight_line(hold, names)
 
 
-def scalar_source(step: StraightLine, repeats: int) -> str:
+def recorded_measure(
+    system: System, measure: Measure, given: int = 0, functions: Any = Recording
+) -> StraightLine:
+    """Record a measure alone: inputs x0... at the end of a step, u0..., g0....
+
+    Args:
+        system: The system.
+        measure: As in `recorded_hold`.
+        given: As in `recorded_hold`.
+        functions: As in `recorded_hold`.
+
+    Returns:
+        Its operations.
+    """
+    n, m = system.state_dim, system.control_dim
+    sizes = {"x": n, "u": m, "g": given}
+    names = [f"{kind}{k}" for kind, count in sizes.items() for k in range(count)]
+    return straight_line(
+        lambda numbers: measure(numbers[:n], numbers[n : n + m], numbers[n + m :], functions), names
+    )
+
+
+def scalar_source(step: StraightLine, repeats: int, tail: StraightLine | None = None) -> str:
     """Return a module in Python that feeds the outputs to the first inputs, repeatedly.
 
     Args:
         step: What is repeated; it has no more outputs than inputs.
         repeats: How often.
+        tail: What is computed at the end, from inputs of the step and from others.
 
     Returns:
-        Source of a function `held` of the inputs, as floats, that returns the outputs as a tuple.
+        Source of a function `held` of the inputs, those of the step first, as floats, that returns
+        the outputs of the step and of the tail as a tuple.
     """
     lines, outputs = statements(step)
     fed = ", ".join(step.inputs[: len(outputs)])
+    ending, measured = statements(tail) if tail is not None else ([], [])
+    others = [name for name in tail.inputs if name not in step.inputs] if tail is not None else []
     return "\n".join(
         [
             IMPORTS,
             "",
-            f"def held({', '.join(step.inputs)}):",
-            f"    for _ in range({repeats}):",
-            *(f"        {line}" for line in lines),
-            f"        {fed} = {', '.join(outputs)}",
-            f"    return {fed}",
+            f"def held({', '.join([*step.inputs, *others])}):",
+            # Written out: a loop in Python costs as much as a few operations.
+            *[f"    {line}" for line in [*lines, f"{fed} = {', '.join(outputs)}"]] * repeats,
+            *(f"    {line}" for line in ending),
+            f"    return {', '.join([fed, *measured])}",
             "",
         ]
     )

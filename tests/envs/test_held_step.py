@@ -3,6 +3,7 @@
 import importlib.util
 import math
 import pickle
+from fractions import Fraction
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -79,6 +80,45 @@ def test_the_vectorisable_sine_and_cosine_are_exact_to_rounding(reach):
         (compiled.VectorFunctions.cos, np.cos),
     ):
         np.testing.assert_allclose(ours(angles), exact(angles), rtol=0.0, atol=6e-16)
+
+
+@pytest.mark.parametrize("powers", [range(3, 18, 2), range(2, 17, 2)])
+def test_economised_series_err_less_than_rounding(powers):
+    """Against the series in fractions, far longer than need be, up to pi/2."""
+    coefficients = [Fraction(one) for one in compiled._economised(powers)]
+    for angle in np.linspace(0.0, math.pi / 2, 41):
+        exact = [
+            Fraction((-1) ** (power // 2), math.factorial(power)) * Fraction(angle) ** power
+            for power in range(powers.start, 40, 2)
+        ]
+        found = [
+            one * Fraction(angle) ** power for one, power in zip(coefficients, powers, strict=True)
+        ]
+        # The coefficients are doubles: their own rounding is a hundredth of that of the result.
+        assert abs(sum(found) - sum(exact)) < Fraction(1, 10**16)
+
+
+@pytest.mark.parametrize("compiled", BACKENDS)
+def test_a_measure_on_floats_is_its_function_bit_for_bit(compiled):
+    settings = task.CartPoleSettings(system=ODD)
+    measure = task.StepMeasure(settings)
+    run = HeldStep(ODD, 0.1, compiled, measure=measure, given=4).run
+    goals = np.random.default_rng(1).uniform(-5.0, 5.0, (40, 4))
+    for state, control, push, goal in zip(*numbers(ODD, 40), goals, strict=True):
+        end = rk4_hold(ODD, state.tolist(), control.tolist(), push.tolist(), 0.1, math)
+        expected = (*end, *measure(end, control.tolist(), goal.tolist(), math))
+        assert run(*state.tolist(), *control.tolist(), *push.tolist(), *goal.tolist()) == expected
+
+
+@needs_numba
+@pytest.mark.parametrize("worlds", [1, 127, 128, 300])
+def test_blocks_that_are_not_full_change_nothing(worlds):
+    state, control, push = (part.T for part in numbers(ODD, 300))
+    whole = HeldBatch(ODD, 0.1, (300,), compiled=True)(state, control, push).copy()
+    part = HeldBatch(ODD, 0.1, (worlds,), compiled=True)
+    for _ in range(2):
+        found = part(state[:, :worlds], control[:, :worlds], push[:, :worlds])
+        np.testing.assert_array_equal(found, whole[:, :worlds])
 
 
 @pytest.mark.parametrize("compiled", BACKENDS)

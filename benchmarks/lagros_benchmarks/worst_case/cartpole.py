@@ -17,7 +17,7 @@ from lagros_envs import cartpole_task as task
 from lagros_envs.disturbances import Disturbance, onto_unit_sphere
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_streams
-from lagros_policies.contraction import Metric
+from lagros_policies.contraction import ContractionMetric
 from lagros_policies.expert import CartPoleExpert
 
 FloatArray = NDArray[np.float64]
@@ -170,7 +170,8 @@ def fly(episodes: Episodes, law: Law, episode: IntArray, pushes: FloatArray) -> 
             following = hold_step(
                 settings.system, state, force, settings.control_period, pushes[:, step]
             )
-        sane = np.all(np.abs(following) <= task.LARGEST_STATE, axis=1)
+            distance = task.goal_distance(following.T, episodes.goals[episode].T, np.sqrt)
+        sane = distance <= task.LARGEST_DISTANCE
         state = np.where((up & sane)[:, None], following, state)
         forces[:, step] = force * up[:, None]
         alive[:, step + 1] = up
@@ -370,11 +371,13 @@ class CartPoleTarget:
                     settings.control_period,
                     self.bound * pushes[:, step],
                 )
-            state = np.clip(np.nan_to_num(state), -task.LARGEST_STATE, task.LARGEST_STATE)
+            state = np.clip(np.nan_to_num(state), -task.LARGEST_DISTANCE, task.LARGEST_DISTANCE)
         return pushes
 
 
-def energy_adversary(metric: Metric) -> Callable[[FloatArray, FloatArray], FloatArray]:
+def energy_adversary(
+    metric: ContractionMetric,
+) -> Callable[[FloatArray, FloatArray], FloatArray]:
     """Return the feedback that pushes along M e, as the disturbance kind "worst" does."""
 
     def push(state: FloatArray, nominal: FloatArray) -> FloatArray:

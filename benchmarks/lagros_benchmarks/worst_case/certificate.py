@@ -48,7 +48,9 @@ class TubeCheck:
 
     Its hypotheses are that the state has stayed in the region of the metric so far and that
     ||u - u*|| <= eps_l; a flight that leaves the region is not held against it any longer. The
-    eps_l of a flight is the one that it had, so that any policy can be asked.
+    eps_l of a flight is the one that it had, so that any policy can be asked. The tube is the
+    paper's formula, with alpha as it is: for a metric of the angle and a disturbance of the angle
+    that is not a bound (`theorems.disturbed_rate`), and what is found here is an observation.
 
     Args:
         expert: The law u* with its metric.

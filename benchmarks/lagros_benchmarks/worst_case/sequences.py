@@ -29,13 +29,13 @@ class Parametrisation(Protocol):
 
 
 @dataclass(frozen=True)
-class Segments:
-    """One direction per segment of the episode, always of length one.
+class _Pieces:
+    """Sequences over pieces of the episode: the numbers that every parametrisation has.
 
     Attributes:
         steps: Control steps of the episode.
         channels: Coordinates of d.
-        pieces: Segments, of equal length but for rounding.
+        pieces: Pieces of the episode.
 
     Raises:
         ValueError: There are more pieces than steps, or a number is below one.
@@ -47,7 +47,21 @@ class Segments:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        _check(self.steps, self.channels, self.pieces)
+        if min(self.steps, self.channels, self.pieces) < 1 or self.pieces > self.steps:
+            raise ValueError(
+                f"steps={self.steps}, channels={self.channels} and pieces={self.pieces} must be "
+                "at least 1, and pieces at most steps"
+            )
+
+
+class Segments(_Pieces):
+    """One direction per segment of the episode, always of length one.
+
+    Attributes:
+        steps: Control steps of the episode.
+        channels: Coordinates of d.
+        pieces: Segments, of equal length but for rounding.
+    """
 
     @property
     def dimension(self) -> int:
@@ -61,26 +75,14 @@ class Segments:
         return rays[:, piece]
 
 
-@dataclass(frozen=True)
-class Knots:
+class Knots(_Pieces):
     """Vectors at equidistant knots, linear between them, shortened to length one.
 
     Attributes:
         steps: Control steps of the episode.
         channels: Coordinates of d.
         pieces: Intervals between the knots.
-
-    Raises:
-        ValueError: There are more pieces than steps, or a number is below one.
     """
-
-    steps: int
-    channels: int
-    pieces: int
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        _check(self.steps, self.channels, self.pieces)
 
     @property
     def dimension(self) -> int:
@@ -96,26 +98,14 @@ class Knots:
         return into_unit_ball((1.0 - share) * values[:, left] + share * values[:, left + 1])
 
 
-@dataclass(frozen=True)
-class Switching:
+class Switching(_Pieces):
     """One direction whose sign switches at a few free times: bang-bang.
 
     Attributes:
         steps: Control steps of the episode.
         channels: Coordinates of d.
         pieces: Constant pieces; there is one switch less.
-
-    Raises:
-        ValueError: There are more pieces than steps, or a number is below one.
     """
-
-    steps: int
-    channels: int
-    pieces: int
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        _check(self.steps, self.channels, self.pieces)
 
     @property
     def dimension(self) -> int:
@@ -179,11 +169,3 @@ def _unit(vectors: FloatArray) -> FloatArray:
     fallback = np.zeros(vectors.shape[-1])
     fallback[0] = 1.0
     return onto_unit_sphere(vectors, fallback)
-
-
-def _check(steps: int, channels: int, pieces: int) -> None:
-    if min(steps, channels, pieces) < 1 or pieces > steps:
-        raise ValueError(
-            f"steps={steps}, channels={channels} and pieces={pieces} must be at least 1, and "
-            "pieces at most steps"
-        )
