@@ -1,38 +1,34 @@
-"""Drawing of the environments with pygame, which is imported when the first frame is asked for."""
+"""Drawing of the cart-pole with pygame, which is imported when the first frame is asked for."""
 
 from __future__ import annotations
 
 import itertools
 import math
-import os
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    import pygame
+from lagros_envs.canvas import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    OVERSAMPLING,
+    PALE,
+    PURPLE,
+    SKY_BLUE,
+    VERMILLION,
+    WHITE,
+    Canvas,
+    Colour,
+    Point,
+    mix,
+)
 
 FloatArray = NDArray[np.float64]
-Colour = tuple[int, int, int]
-Point = tuple[float, float]
-
-# Okabe and Ito's palette, which colour-blind readers tell apart.
-BLACK: Colour = (0, 0, 0)
-ORANGE: Colour = (230, 159, 0)
-SKY_BLUE: Colour = (86, 180, 233)
-GREEN: Colour = (0, 158, 115)
-BLUE: Colour = (0, 114, 178)
-VERMILLION: Colour = (213, 94, 0)
-PURPLE: Colour = (204, 121, 167)
-WHITE: Colour = (255, 255, 255)
-GREY: Colour = (110, 110, 110)
-PALE: Colour = (225, 225, 225)
 
 WIDTH, HEIGHT = 800, 400  # [px]
-# Frames are drawn larger and shrunk, which smooths every edge.
-OVERSAMPLING = 2
 RAIL_HEIGHT = 352  # of the rail, from the top [px]
 CART_SIZE = (0.52, 0.26)  # width, height [m]
 SMALLEST_SPAN = 7.0  # width of the view when cart and goal are close [m]
@@ -40,36 +36,12 @@ MARGIN = 1.5  # kept beside cart and goal [m] ...
 MARGIN_PIXELS = 110  # ... and at least this, where an arrow fits [px]
 TUBE_HEIGHT = 1.62  # of the coloured band above the rail [m]
 ARROW_LENGTH = 80  # of a disturbance as large as its bound [px]
-SHORTEST_ARROW = 3.0  # anything less is not drawn [px]
 PLOT_DURATION = 9.0  # shown at least [s]
 PLOT_HEIGHT = 3.5  # shown at least, in units of the state norm
 PLOT = (262, 18, 240, 96)  # left, top, width, height of the plot over time [px]
 
 
-def import_pygame() -> ModuleType:
-    """Import pygame, without its greeting.
-
-    Raises:
-        ImportError: The extra `lagros[render]` is not installed.
-    """
-    # A library has no business printing a greeting.
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    try:
-        import pygame
-    except ImportError as error:
-        raise ImportError(
-            'rendering needs pygame, which is not installed: pip install "lagros[render]"'
-        ) from error
-    return pygame
-
-
-def mix(colour: Colour, share: float) -> Colour:
-    """Fade a colour towards white; a share of 1 leaves it as it is."""
-    red, green, blue = (round(share * part + (1.0 - share) * 255) for part in colour)
-    return red, green, blue
-
-
-class CartPoleRenderer:
+class CartPoleRenderer(Canvas):
     """Draws the cart-pole, its goal, the tube and the disturbance.
 
     The view scrolls and zooms with cart and goal, so that both stay in it however far the cart
@@ -85,20 +57,9 @@ class CartPoleRenderer:
 
     def __init__(self, render_mode: str, fps: int) -> None:
         """Prepare a canvas, and a window in the mode "human"."""
-        library = self._pygame = import_pygame()
-        self._fps = fps
-        self._window: pygame.Surface | None = None
-        self._clock: pygame.time.Clock | None = None
-        library.font.init()
-        self._fonts = {size: library.font.Font(None, size * OVERSAMPLING) for size in (17, 20)}
+        super().__init__(render_mode, fps, (WIDTH, HEIGHT), "lagros/CartPole-v0", (17, 20))
         # (t, distance to the goal, radius) of the frames of this episode.
         self._history: list[tuple[float, float, float]] = []
-        self._canvas = library.Surface((WIDTH * OVERSAMPLING, HEIGHT * OVERSAMPLING))
-        if render_mode == "human":
-            library.display.init()
-            self._window = library.display.set_mode((WIDTH, HEIGHT))
-            library.display.set_caption("lagros/CartPole-v0")
-            self._clock = library.time.Clock()
 
     def draw(
         self,
@@ -127,7 +88,6 @@ class CartPoleRenderer:
         Returns:
             The frame, shape (400, 800, 3), in the mode "rgb_array"; None in the mode "human".
         """
-        pygame = self._pygame
         left, right = sorted((float(state[0]), float(goal[0])))
         apart = right - left
         self._span = max(
@@ -148,22 +108,7 @@ class CartPoleRenderer:
         self._draw_disturbance(state, share, half_length)
         self._draw_legend(time, distance, tube_radius, disturbance_bound, nominal is not None)
         self._draw_plot(time, distance, tube_radius)
-        frame = pygame.transform.smoothscale(self._canvas, (WIDTH, HEIGHT))
-        if self._window is None:
-            # pygame counts columns first.
-            return np.transpose(pygame.surfarray.array3d(frame), (1, 0, 2)).copy()
-        self._window.blit(frame, (0, 0))
-        pygame.event.pump()
-        pygame.display.flip()
-        if self._clock is not None:
-            self._clock.tick(self._fps)
-        return None
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._window is not None:
-            self._pygame.display.quit()
-            self._window = None
+        return self._shown()
 
     # Coordinates: metres along and above the rail to pixels of the enlarged canvas.
 
@@ -346,56 +291,6 @@ class CartPoleRenderer:
         self._text(f"{latest:g} s", (left + width, below), GREY, 17, anchor="center")
         label = left - 6 * OVERSAMPLING
         self._text(f"{highest:.1f}", (label, top + 4 * OVERSAMPLING), GREY, 17, anchor="midright")
-
-    # Strokes.
-
-    def _line(self, start: Point, end: Point, colour: Colour, width: float) -> None:
-        # A polygon: pygame cuts the ends of its own thick lines along the axes.
-        across, down = end[0] - start[0], end[1] - start[1]
-        share = 0.5 * width * OVERSAMPLING / max(1e-9, math.hypot(across, down))
-        side, rise = -share * down, share * across
-        corners = [
-            (start[0] + side, start[1] + rise),
-            (end[0] + side, end[1] + rise),
-            (end[0] - side, end[1] - rise),
-            (start[0] - side, start[1] - rise),
-        ]
-        self._pygame.draw.polygon(self._canvas, colour, corners)
-
-    def _dashed(self, start: Point, end: Point, colour: Colour, width: float) -> None:
-        across, down = end[0] - start[0], end[1] - start[1]
-        count = max(1, round(math.hypot(across, down) / (12 * OVERSAMPLING)))
-        for dash in range(count):
-            first, second = dash / count, (dash + 0.55) / count
-            self._line(
-                (start[0] + first * across, start[1] + first * down),
-                (start[0] + second * across, start[1] + second * down),
-                colour,
-                width,
-            )
-
-    def _arrow(self, start: Point, end: Point, colour: Colour, width: float) -> None:
-        across, down = end[0] - start[0], end[1] - start[1]
-        length = math.hypot(across, down)
-        if length < SHORTEST_ARROW * OVERSAMPLING:
-            return
-        across, down = across / length, down / length
-        head = min(length, 11.0 * OVERSAMPLING)
-        neck = (end[0] - head * across, end[1] - head * down)
-        if length > head:
-            self._line(start, neck, colour, width)
-        wing = 0.5 * head
-        corners = [
-            end,
-            (neck[0] - wing * down, neck[1] + wing * across),
-            (neck[0] + wing * down, neck[1] - wing * across),
-        ]
-        self._pygame.draw.polygon(self._canvas, colour, corners)
-
-    def _text(self, text: str, place: Point, colour: Colour, size: int, anchor: str) -> None:
-        image = self._fonts[size].render(text, True, colour)
-        position: dict[str, Any] = {anchor: (round(place[0]), round(place[1]))}
-        self._canvas.blit(image, image.get_rect(**position))
 
 
 def _tick_spacing(span: float) -> float:

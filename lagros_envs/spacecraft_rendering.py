@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.rendering import (
+from lagros_envs.canvas import (
     BLACK,
     BLUE,
     GREEN,
@@ -20,15 +20,12 @@ from lagros_envs.rendering import (
     SKY_BLUE,
     VERMILLION,
     WHITE,
+    Canvas,
     Colour,
     Point,
-    import_pygame,
     mix,
 )
 from lagros_envs.spacecraft_world import SpacecraftWorld
-
-if TYPE_CHECKING:
-    import pygame
 
 FloatArray = NDArray[np.float64]
 
@@ -54,7 +51,7 @@ THRUSTERS = (
 )
 
 
-class SpacecraftRenderer:
+class SpacecraftRenderer(Canvas):
     """Draws the first world: arena, obstacles, goals, tubes, agents, thrusters and collisions.
 
     The view holds arena and scenario, and widens for agents that leave it. Only the mode "human"
@@ -71,22 +68,12 @@ class SpacecraftRenderer:
 
     def __init__(self, render_mode: str, fps: int, arena: float) -> None:
         """Prepare a canvas, and a window in the mode "human"."""
-        library = self._pygame = import_pygame()
-        self._fps, self._arena = fps, arena
-        self._window: pygame.Surface | None = None
-        self._clock: pygame.time.Clock | None = None
-        library.font.init()
-        self._fonts = {size: library.font.Font(None, size * OVERSAMPLING) for size in (15, 17, 20)}
         size = (VIEW + PANEL, VIEW)
-        self._canvas = library.Surface((size[0] * OVERSAMPLING, size[1] * OVERSAMPLING))
+        super().__init__(render_mode, fps, size, "lagros/Spacecraft-v0", (15, 17, 20))
+        self._arena = arena
         # (t, positions) of the frames of this episode.
         self._trail: list[tuple[float, FloatArray]] = []
         self._low, self._side = np.zeros(2), arena
-        if render_mode == "human":
-            library.display.init()
-            self._window = library.display.set_mode(size)
-            library.display.set_caption("lagros/Spacecraft-v0")
-            self._clock = library.time.Clock()
 
     def draw(self, world: SpacecraftWorld) -> NDArray[np.uint8] | None:
         """Draw one frame of the first world.
@@ -97,7 +84,6 @@ class SpacecraftRenderer:
         Returns:
             The frame, shape (640, 840, 3), in the mode "rgb_array"; None in the mode "human".
         """
-        pygame = self._pygame
         time = float(world.time[0])
         positions = world.parts[:2, 0].T.copy()
         while self._trail and self._trail[-1][0] >= time:  # a new episode, or a frame redrawn
@@ -115,22 +101,7 @@ class SpacecraftRenderer:
             self._draw_agent(world, agent)
         self._draw_nominal(world)
         self._draw_panel(world, time)
-        frame = pygame.transform.smoothscale(self._canvas, (VIEW + PANEL, VIEW))
-        if self._window is None:
-            # pygame counts columns first.
-            return np.transpose(pygame.surfarray.array3d(frame), (1, 0, 2)).copy()
-        self._window.blit(frame, (0, 0))
-        pygame.event.pump()
-        pygame.display.flip()
-        if self._clock is not None:
-            self._clock.tick(self._fps)
-        return None
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._window is not None:
-            self._pygame.display.quit()
-            self._window = None
+        return self._shown()
 
     # Coordinates: metres to pixels of the enlarged canvas.
 
@@ -372,11 +343,6 @@ class SpacecraftRenderer:
 
     def _polygon(self, corners: list[FloatArray], colour: Colour) -> None:
         self._pygame.draw.polygon(self._canvas, colour, [self._point(place) for place in corners])
-
-    def _text(self, text: str, place: Point, colour: Colour, size: int, anchor: str) -> None:
-        image = self._fonts[size].render(text, True, colour)
-        position: dict[str, Any] = {anchor: (round(place[0]), round(place[1]))}
-        self._canvas.blit(image, image.get_rect(**position))
 
 
 _SQUARE = ((1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0))

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from lagros_envs import spacecraft_task as task
 from lagros_envs.dynamics.spacecraft import HEADING, SPIN
 from lagros_envs.observation import OBSTACLE_DIM
-from lagros_envs.scenarios import Preset, preset_named
+from lagros_envs.scenarios import Preset
 from lagros_policies.contraction.double_integrator import planned_margin
 from lagros_policies.contraction.wrench_control import WrenchTracking
 from lagros_policies.planning.joint_plan import JointPlan
 from lagros_policies.planning.spacecraft import SpacecraftPlanner, SpacecraftPlannerSettings
-from lagros_policies.policy import PolicyState
+from lagros_policies.policy import PolicyState, row_memories
+from lagros_policies.spacecraft_setup import task_and_preset
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -130,8 +131,7 @@ class CentralizedPolicy:
         planner: SpacecraftPlannerSettings | None = None,
     ) -> None:
         """Build planner and law."""
-        self.settings = settings or task.SpacecraftSettings()
-        self.preset = preset_named(preset).for_agents(num_agents)
+        self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.agents = self.preset.agents
         self.obstacles = max(1, self.preset.obstacle_count[1])
         if margin is not None and planner is not None:
@@ -173,18 +173,12 @@ class CentralizedPolicy:
         """
         rows = np.atleast_2d(np.asarray(observation, np.float64))
         self._check(rows, np.shape(observation))
-        memories: list[CentralizedState | None] = (
-            [None] * len(rows) if state is None else list(state)
+        memories: list[CentralizedState | None] = row_memories(
+            state, episode_start, len(rows), "worlds"
         )
-        starts = np.zeros(len(rows), bool) if episode_start is None else np.ravel(episode_start)
-        if len(memories) != len(rows) or len(starts) != len(rows):
-            raise ValueError(
-                f"state remembers {len(memories)} worlds and episode_start is for {len(starts)}; "
-                f"{len(rows)} are observed"
-            )
         following = [
-            self._start(row) if memory is None or start else self._same(row, memory)
-            for row, memory, start in zip(rows, memories, starts, strict=True)
+            self._start(row) if memory is None else self._same(row, memory)
+            for row, memory in zip(rows, memories, strict=True)
         ]
         steps = [self._step(row) for row in rows]
         # The clock of an episode that ran past its limit stands still.

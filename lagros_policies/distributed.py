@@ -11,14 +11,16 @@ from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
 from lagros_envs.observation import Layout
-from lagros_envs.scenarios import Preset, preset_named
+from lagros_envs.scenarios import Preset
 from lagros_policies.contraction.double_integrator import planned_margin
 from lagros_policies.contraction.wrench_control import WrenchTracking
 from lagros_policies.planning.local_map import LocalMap
 from lagros_policies.planning.local_motion import Discs, LocalPlan
-from lagros_policies.planning.local_plan import LocalPlanner, LocalPlannerSettings
-from lagros_policies.policy import PolicyState
+from lagros_policies.planning.local_plan import LocalPlanner
+from lagros_policies.planning.local_problem import LocalPlannerSettings
+from lagros_policies.policy import PolicyState, row_memories
 from lagros_policies.sensed import Sensed
+from lagros_policies.spacecraft_setup import task_and_preset
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -126,8 +128,7 @@ class DistributedTubeMpcPolicy:
         planner: LocalPlannerSettings | None = None,
     ) -> None:
         """Build planner and law."""
-        self.settings = settings or task.SpacecraftSettings()
-        self.preset = preset_named(preset).for_agents(num_agents)
+        self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
         if replan_every < 1:
             raise ValueError(f"replan_every={replan_every!r} must be at least 1 control step")
@@ -170,17 +171,10 @@ class DistributedTubeMpcPolicy:
         """
         sensed = Sensed.of(self.layout, observation)
         count = len(sensed.time)
-        memories: list[DistributedState | None] = [None] * count if state is None else list(state)
-        starts = np.zeros(count, bool) if episode_start is None else np.ravel(episode_start)
-        if len(memories) != count or len(starts) != count:
-            raise ValueError(
-                f"state remembers {len(memories)} agents and episode_start is for {len(starts)}; "
-                f"{count} are observed"
-            )
-        following = [
-            DistributedState() if memory is None or start else memory
-            for memory, start in zip(memories, starts, strict=True)
-        ]
+        memories: list[DistributedState | None] = row_memories(
+            state, episode_start, count, "agents"
+        )
+        following = [DistributedState() if memory is None else memory for memory in memories]
         nominal, accelerations = np.zeros((count, task.STATE_DIM)), np.zeros((count, 3))
         for row, memory in enumerate(following):
             nominal[row, [0, 1, 3, 4]], accelerations[row, :2] = self._follow(sensed, row, memory)

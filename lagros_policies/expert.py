@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.dynamics import linearise_hold
-from lagros_policies.contraction import HeldControl, Metric, load_metric
+from lagros_policies.contraction import ContractionMetric, HeldControl, load_metric
 from lagros_policies.contraction.feedback import (
     FeedbackSettings,
     GainTable,
@@ -50,7 +50,7 @@ class CartPoleExpert:
 
     def __init__(
         self,
-        metric: Metric | None = None,
+        metric: ContractionMetric | None = None,
         task: CartPoleSettings | None = None,
         feedback: FeedbackSettings | None = None,
     ) -> None:

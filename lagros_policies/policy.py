@@ -69,6 +69,30 @@ class Policy(Protocol):
         """
 
 
+def row_memories(
+    state: PolicyState, episode_start: NDArray[np.bool_] | None, count: int, rows: str
+) -> list[Any]:
+    """Return what is remembered of each row of an observation, None where its episode starts.
+
+    Args:
+        state: What `Policy.predict` returned last: one memory per row; None if it is new.
+        episode_start: Which rows start an episode, shape (count,); None if none does.
+        count: Number of rows observed.
+        rows: What a row is, in the plural, for the message.
+
+    Raises:
+        ValueError: Memories, starts and rows are not equally many.
+    """
+    memories = [None] * count if state is None else list(state)
+    starts = np.zeros(count, bool) if episode_start is None else np.ravel(episode_start)
+    if len(memories) != count or len(starts) != count:
+        raise ValueError(
+            f"state remembers {len(memories)} {rows} and episode_start is for {len(starts)}; "
+            f"{count} are observed"
+        )
+    return [None if start else memory for memory, start in zip(memories, starts, strict=True)]
+
+
 def make(name: str, env: Any, **settings: Any) -> Policy:
     """Build a policy for an environment.
 

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from lagros_envs import spacecraft_task as task
 from lagros_envs.dynamics.spacecraft import HEADING, SPIN, VELOCITY_X
 from lagros_envs.observation import OBSTACLE_DIM, Layout
-from lagros_envs.scenarios import Preset, preset_named
+from lagros_envs.scenarios import Preset
 from lagros_policies.barrier import BarrierSettings, BrakingBarrier, HalfPlanes
 from lagros_policies.contraction.thrusters import allocate, to_body
 from lagros_policies.half_planes import nearest
 from lagros_policies.policy import Policy, PolicyState
 from lagros_policies.sensed import Sensed
+from lagros_policies.spacecraft_setup import task_and_preset
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -96,8 +97,7 @@ class SafetyFilter:
         self.policy = policy
         self.name = f"{policy.name}+filter"
         self.observes = policy.observes
-        self.settings = settings or task.SpacecraftSettings()
-        self.preset = preset_named(preset).for_agents(num_agents)
+        self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
         chosen = BarrierSettings.for_bound(disturbance_bound) if barrier is None else barrier
         limit = self.settings.thrust_limit

@@ -15,7 +15,7 @@ from lagros_envs import cartpole_task as task
 from lagros_policies.contraction import Metric, load_metric
 from lagros_policies.expert import CartPoleExpert, TrackedPlans
 from lagros_policies.planning import Trajectory
-from lagros_policies.policy import PolicyState
+from lagros_policies.policy import PolicyState, row_memories
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -98,14 +98,10 @@ class TubeMpcPolicy:
     ) -> tuple[Float32Array, PolicyState]:
         """Plan if it is time, and track; see `Policy.predict`. The state is one per row."""
         rows = np.atleast_2d(np.asarray(observation, np.float64))
-        memories: list[TubeMpcState | None] = [None] * len(rows) if state is None else list(state)
-        if len(memories) != len(rows):
-            raise ValueError(f"state remembers {len(memories)} episodes; {len(rows)} are observed")
-        starts = np.zeros(len(rows), bool) if episode_start is None else episode_start
-        fresh = [
-            TubeMpcState() if memory is None or start else memory
-            for memory, start in zip(memories, starts, strict=True)
-        ]
+        memories: list[TubeMpcState | None] = row_memories(
+            state, episode_start, len(rows), "episodes"
+        )
+        fresh = [TubeMpcState() if memory is None else memory for memory in memories]
         force = np.array(
             [self._force(row, memory) for row, memory in zip(rows, fresh, strict=True)]
         )

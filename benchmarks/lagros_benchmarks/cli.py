@@ -25,8 +25,10 @@ from lagros_benchmarks.watch import watch
 if TYPE_CHECKING:
     from lagros_benchmarks.records import Row
     from lagros_benchmarks.report import Outputs
+    from lagros_benchmarks.reproduction import Reproduction
     from lagros_benchmarks.runner import Progress
     from lagros_benchmarks.settings import BenchmarkSettings
+    from lagros_policies.backends import Backend
 
 USAGE_ERROR = 2
 DEMO_FOLDER = Path("runs/demo")
@@ -238,6 +240,7 @@ def reproduce(
     ] = False,
 ) -> None:
     """From nothing to the table and figures: metric or expert, data, training, benchmark."""
+    from lagros_benchmarks.reproduction import reproduce as run_reproduction
     from lagros_benchmarks.settings import check_task
     from lagros_policies.backends import Backend, BackendError, running
 
@@ -246,31 +249,28 @@ def reproduce(
         check_task(task)
         workers = Backend(backend, address)
         with progress_bar() as progress, running(workers, jobs):
-            if task == "cartpole":
-                from lagros_benchmarks.reproduce import ReproduceSettings, reproduce_cartpole
-
-                made = ReproduceSettings(jobs=jobs, episodes=episodes or 50, backend=workers)
-                benchmark = (
-                    made.shipped_benchmark
-                    if shipped
-                    else reproduce_cartpole(place, made, progress, progress_line)
-                )
-            else:
-                from lagros_benchmarks import reproduce_spacecraft as spacecraft
-
-                wanted = spacecraft.SpacecraftReproduceSettings(
-                    jobs=jobs, worlds=episodes or 20, backend=workers
-                )
-                benchmark = (
-                    wanted.benchmark(None)
-                    if shipped
-                    else spacecraft.reproduce_spacecraft(place, wanted, progress, progress_line)
-                )
+            wanted = _reproduction(task, episodes, jobs, workers)
+            benchmark = (
+                wanted.benchmark(None)
+                if shipped
+                else run_reproduction(place, wanted, progress, progress_line)
+            )
     except ValueError as error:
         fail(error)
     except BackendError as error:
         fail(error, status=1)
     run_and_report(benchmark, _reproduced(task, place))
+
+
+def _reproduction(task: str, episodes: int | None, jobs: int, backend: Backend) -> Reproduction:
+    """Return what a task's run makes."""
+    if task == "cartpole":
+        from lagros_benchmarks.reproduce import ReproduceSettings
+
+        return ReproduceSettings(jobs=jobs, episodes=episodes or 50, backend=backend)
+    from lagros_benchmarks.reproduce_spacecraft import SpacecraftReproduceSettings
+
+    return SpacecraftReproduceSettings(jobs=jobs, worlds=episodes or 20, backend=backend)
 
 
 def _reproduced(task: str, folder: Path) -> Outputs:

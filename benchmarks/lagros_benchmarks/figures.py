@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,6 +25,8 @@ from lagros_benchmarks.formats import by_condition, condition_title, policy_labe
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+_LONGEST_LEGEND = 7  # policies that an empty panel has room for
 
 __all__ = ["check_figure_path", "draw", "error_figure", "grid_figure", "styles"]
 
@@ -111,7 +113,7 @@ def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
     path = check_figure_path(path)
     kinds = list(dict.fromkeys(row["disturbance"] for row in rows))
     policies = list(dict.fromkeys(row["policy"] for row in rows))
-    columns = min(len(kinds), 3)
+    columns = _columns(len(kinds))
     lines = -(-len(kinds) // columns)
     figure, panels = canvas(max(2.6 * columns, 4.5), 2.3 * lines + 0.9, lines, columns)
     bounds = sorted({row["bound"] for row in rows})
@@ -148,15 +150,18 @@ def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
     figure.supxlabel("disturbance bound d̄  [state units/s]", fontsize=10)
     figure.supylabel("success [%], 95 % interval", fontsize=10)
     handles, names = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles,
-        names,
-        loc="outside upper left",
-        ncols=min(len(names), 4),
-        frameon=False,
-        handlelength=3.5,
-    )
+    look: dict[str, Any] = {"frameon": False, "handlelength": 3.5}
+    if len(kinds) < len(panels) and len(names) <= _LONGEST_LEGEND:
+        panels[len(kinds)].legend(handles, names, loc="center left", **look)
+    else:
+        columns = min(len(names), 4)
+        figure.legend(handles, names, loc="outside upper left", ncols=columns, **look)
     return save(figure, path)
+
+
+def _columns(panels: int) -> int:
+    """Return how many panels stand beside each other: up to three, or four if fewer stay empty."""
+    return min(range(min(panels, 3), min(panels, 4) + 1), key=lambda columns: -panels % columns)
 
 
 def _draw_certified(

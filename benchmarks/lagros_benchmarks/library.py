@@ -129,8 +129,9 @@ def load_metric(path: str | None) -> Callable[[FloatArray], FloatArray]:
 def certified_radius(path: str | None, bound: float, times: FloatArray) -> FloatArray:
     """Return the radius of our own certified tube at the times [s].
 
-    It is the tube of u* itself: a learning error would only widen it, and all policies are held
-    against the same one.
+    It is the tube of u* itself, by the paper's formula (`contraction.certified_tube` says what that
+    leaves out): a learning error would only widen it, and all policies are held against the same
+    one.
 
     Args:
         path: File of the metric, or None for the shipped one.

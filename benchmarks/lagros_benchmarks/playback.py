@@ -187,7 +187,7 @@ class Playback:
             yield frame
 
     def _show(self) -> None:
-        from lagros_envs.rendering import import_pygame
+        from lagros_envs.canvas import import_pygame
 
         pygame = import_pygame()
         try:

@@ -8,16 +8,16 @@ machine.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_benchmarks.runner import Progress
+from lagros_benchmarks.experiment import Progress
+from lagros_benchmarks.reproduction import Say
 from lagros_benchmarks.settings import BenchmarkSettings
 from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.files import write_atomic
@@ -26,7 +26,6 @@ from lagros_policies.contraction import Metric, load_metric, save_metric
 from lagros_policies.imitation.dataset import ExpertData, ExpertDataSettings, generate
 from lagros_policies.imitation.features import FEATURES, cartpole_features
 from lagros_policies.imitation.networks import Mlp
-from lagros_policies.imitation.shards import claim
 from lagros_policies.imitation.train import TrainingSettings, fit, learning_error
 from lagros_policies.metric_design import MetricDesignSettings, design_cartpole_metric
 
@@ -59,9 +58,52 @@ class ReproduceSettings:
     jobs: int = 2
     backend: Backend = LOKY
 
-    @property
-    def shipped_benchmark(self) -> BenchmarkSettings:
-        """Return the benchmark of the shipped metric and weights."""
+    free: ClassVar[tuple[str, ...]] = ("jobs", "backend", "episodes", "seed", "bound")
+
+    def make(self, folder: Path, progress: Progress, say: Say) -> None:
+        """Make metric, data and networks; see `reproduction.reproduce`."""
+        task = CartPoleSettings()
+        metric = _metric(folder, self, task, progress, say)
+        begun = perf_counter()
+        data = generate(
+            folder / "data",
+            metric,
+            self.data,
+            task,
+            self.jobs,
+            lambda done: progress("expert data", done, self.data.shards),
+            self.backend,
+        )
+        say(
+            f"expert data ({perf_counter() - begun:.0f} s): {len(data.observation)} samples around "
+            f"{len(data.plan_states)} plans; "
+            f"{data.drawn - len(data.observation)} states outside the verified region were rejected"
+        )
+        # (c) imitates u* in the tube, (a) imitates u_d on the plans.
+        targets = {
+            "lagros": (self.lagros, data.observation, data.control, data.plan),
+            "learned": (self.learned, *data.nominal_pairs(task), _plan_of_pairs(data)),
+        }
+        for name, (training, observation, control, plan) in targets.items():
+            _network(folder, name, training, observation, control, plan, progress, say)
+
+    def benchmark(self, folder: Path | None) -> BenchmarkSettings:
+        """Return the benchmark of (a), (b), (c) and LQR.
+
+        Args:
+            folder: Where metric and weights lie; None takes the shipped ones.
+        """
+        made: dict[str, Any] = {}
+        if folder is not None:
+            metric = str(folder / "metric.json")
+            made = {
+                "metric": metric,
+                "policy_settings": {
+                    "learned": {"weights": str(_weights(folder, "learned"))},
+                    "tube-mpc": {"metric": metric},
+                    "lagros": {"weights": str(_weights(folder, "lagros"))},
+                },
+            }
         return BenchmarkSettings(
             policies=_POLICIES,
             episodes=self.episodes,
@@ -69,70 +111,15 @@ class ReproduceSettings:
             seed=self.seed,
             jobs=self.jobs,
             backend=self.backend,
+            **made,
         )
 
 
 _POLICIES = ("learned", "tube-mpc", "lagros", "lqr")
 
 
-def reproduce_cartpole(
-    folder: Path,
-    settings: ReproduceSettings | None = None,
-    progress: Progress | None = None,
-    say: Callable[[str], None] | None = None,
-) -> BenchmarkSettings:
-    """Make metric, data and networks of the cart-pole.
-
-    Args:
-        folder: Where everything is kept.
-        settings: What to make.
-        progress: Called with a title, the units done and the units in all.
-        say: Called with a line after each stage.
-
-    Returns:
-        The benchmark of (a), (b), (c) and LQR with what was made, ready to run.
-
-    Raises:
-        ValueError: The folder holds a run of other settings.
-    """
-    settings = settings or ReproduceSettings()
-    folder = folder.absolute()
-    update = progress or (lambda title, done, total: None)
-    note = say or (lambda line: None)
-    task = CartPoleSettings()
-    _claim(folder, settings)
-    metric = _metric(folder, settings, task, update, note)
-    begun = perf_counter()
-    data = generate(
-        folder / "data",
-        metric,
-        settings.data,
-        task,
-        settings.jobs,
-        lambda done: update("expert data", done, settings.data.shards),
-        settings.backend,
-    )
-    note(
-        f"expert data ({perf_counter() - begun:.0f} s): {len(data.observation)} samples around "
-        f"{len(data.plan_states)} plans; "
-        f"{data.drawn - len(data.observation)} states outside the verified region were rejected"
-    )
-    # (c) imitates u* in the tube, (a) imitates u_d on the plans.
-    targets = {
-        "lagros": (settings.lagros, data.observation, data.control, data.plan),
-        "learned": (settings.learned, *data.nominal_pairs(task), _plan_of_pairs(data)),
-    }
-    for name, (training, observation, control, plan) in targets.items():
-        _network(folder, name, training, observation, control, plan, update, note)
-    return replace(
-        settings.shipped_benchmark,
-        metric=str(folder / "metric.json"),
-        policy_settings={
-            "learned": {"weights": str(folder / "cartpole_learned.safetensors")},
-            "tube-mpc": {"metric": str(folder / "metric.json")},
-            "lagros": {"weights": str(folder / "cartpole_lagros.safetensors")},
-        },
-    )
+def _weights(folder: Path, name: str) -> Path:
+    return folder / f"cartpole_{name}.safetensors"
 
 
 def _metric(
@@ -140,7 +127,7 @@ def _metric(
     settings: ReproduceSettings,
     task: CartPoleSettings,
     update: Progress,
-    note: Callable[[str], None],
+    note: Say,
 ) -> Metric:
     path = folder / "metric.json"
     begun = perf_counter()
@@ -167,10 +154,10 @@ def _network(
     control: NDArray[np.float64],
     plan: NDArray[np.intp],
     update: Progress,
-    note: Callable[[str], None],
+    note: Say,
 ) -> None:
     """Fit one network, unless its file is there, and write its training record beside it."""
-    weights = folder / f"cartpole_{name}.safetensors"
+    weights = _weights(folder, name)
     features, side = cartpole_features(observation.astype(np.float32))
     labels: Float32Array = (control * side[:, None]).astype(np.float32)
     held_out = _held_out(plan, training.held_out)
@@ -210,12 +197,3 @@ def _held_out(plan: NDArray[np.intp], share: float) -> NDArray[np.bool_]:
 def _plan_of_pairs(data: ExpertData) -> NDArray[np.intp]:
     plans, steps = data.plan_controls.shape[:2]
     return np.repeat(np.arange(plans), steps)
-
-
-def _claim(folder: Path, settings: ReproduceSettings) -> None:
-    """Refuse to go on with files of other settings; the jobs do not matter."""
-    record = asdict(settings)
-    for free in ("jobs", "backend", "episodes", "seed", "bound"):
-        del record[free]
-    folder.mkdir(parents=True, exist_ok=True)
-    claim(folder / "settings.json", record, "a run")

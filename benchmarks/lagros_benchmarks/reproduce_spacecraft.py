@@ -9,22 +9,21 @@ files, bit for bit on one machine.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from lagros_benchmarks.experiment import Progress
+from lagros_benchmarks.reproduction import Say
 from lagros_benchmarks.settings import BenchmarkSettings
 from lagros_envs.files import write_atomic
 from lagros_envs.scenarios import preset_named
 from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_policies.backends import LOKY, Backend
 from lagros_policies.imitation.deep_set import DeepSet
-from lagros_policies.imitation.shards import claim
 from lagros_policies.imitation.spacecraft_flights import FlightData, FlightSettings, fly_expert
 from lagros_policies.imitation.train_deep_set import (
     DeepSetTraining,
@@ -94,9 +93,27 @@ class SpacecraftReproduceSettings:
     seed: int = 0
     jobs: int = 2
     backend: Backend = LOKY
+    free: ClassVar[tuple[str, ...]] = ("jobs", "backend", "worlds", "seed", "bounds")
+
+    def make(self, folder: Path, progress: Progress, say: Say) -> None:
+        """Make expert flights and networks; see `reproduction.reproduce`."""
+        stage = _Stage(folder, self, progress, say)
+        calm = stage.fly("calm flights", self.calm, None)
+        stage.fit("learned", self.learned, [calm], calm)
+        parts = [stage.fly("flights", self.flights, None)]
+        learner = stage.fit("round0", self.intermediate, parts, parts[0])
+        for index, flights in enumerate(self.rounds, start=1):
+            met = stage.fly(f"{_RELABELLED}{index}", flights, learner)
+            kept = training_part(met, self)
+            parts += [kept] * self.relabelled_weight
+            last = index == len(self.rounds)
+            name, training = (
+                ("lagros", self.lagros) if last else (f"round{index}", self.intermediate)
+            )
+            learner = stage.fit(name, training, parts, _held_out_part(met, self.held_out))
 
     def benchmark(self, folder: Path | None) -> BenchmarkSettings:
-        """Return the benchmark of the four policies.
+        """Return the benchmark of (a), (b), (c) and (d).
 
         Args:
             folder: Where the weights lie; None takes the shipped ones.
@@ -120,50 +137,6 @@ class SpacecraftReproduceSettings:
 _NETWORKS = ("lagros", "learned")
 
 
-def reproduce_spacecraft(
-    folder: Path,
-    settings: SpacecraftReproduceSettings | None = None,
-    progress: Progress | None = None,
-    say: Callable[[str], None] | None = None,
-) -> BenchmarkSettings:
-    """Make expert flights and networks of the spacecraft.
-
-    Args:
-        folder: Where everything is kept.
-        settings: What to make.
-        progress: Called with a title, the units done and the units in all.
-        say: Called with a line after each stage.
-
-    Returns:
-        The benchmark of (a), (b), (c) and (d) with what was made, ready to run.
-
-    Raises:
-        ValueError: The folder holds a run of other settings.
-    """
-    settings = settings or SpacecraftReproduceSettings()
-    folder = folder.absolute()
-    record = asdict(settings)
-    for free in ("jobs", "backend", "worlds", "seed", "bounds"):
-        del record[free]
-    folder.mkdir(parents=True, exist_ok=True)
-    claim(folder / "settings.json", record, "a run")
-    stage = _Stage(folder, settings, progress or (lambda *_: None), say or (lambda line: None))
-    calm = stage.fly("calm flights", settings.calm, None)
-    stage.fit("learned", settings.learned, [calm], calm)
-    parts = [stage.fly("flights", settings.flights, None)]
-    learner = stage.fit("round0", settings.intermediate, parts, parts[0])
-    for index, flights in enumerate(settings.rounds, start=1):
-        met = stage.fly(f"{_RELABELLED}{index}", flights, learner)
-        kept = training_part(met, settings)
-        parts += [kept] * settings.relabelled_weight
-        last = index == len(settings.rounds)
-        name, training = (
-            ("lagros", settings.lagros) if last else (f"round{index}", settings.intermediate)
-        )
-        learner = stage.fit(name, training, parts, _held_out_part(met, settings.held_out))
-    return settings.benchmark(folder)
-
-
 @dataclass
 class _Stage:
     """The stages of one run, each resumable."""
@@ -171,7 +144,7 @@ class _Stage:
     folder: Path
     settings: SpacecraftReproduceSettings
     progress: Progress
-    say: Callable[[str], None]
+    say: Say
     task: SpacecraftSettings = field(default_factory=SpacecraftSettings)
 
     def fly(self, name: str, flights: FlightSettings, learner: Path | None) -> FlightData:

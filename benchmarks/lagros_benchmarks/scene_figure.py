@@ -43,7 +43,7 @@ def scene_figure(scene: Scene, path: str | Path) -> Path:
     if len(scene.panels) == 4:
         columns = 2  # a square of panels shows more of each
     lines = -(-len(scene.panels) // columns)
-    figure, axes = canvas(3.6 * columns, 3.75 * lines + 0.7, lines, columns)
+    figure, axes = canvas(3.6 * columns, 3.9 * lines + 0.7, lines, columns)
     low, high = _view(scene)
     for panel, place in zip(scene.panels, axes, strict=False):
         _draw_world(place, scene)
@@ -95,12 +95,12 @@ def _title(panel: ScenePanel) -> str:
     arrived = sum(agent.success for agent in agents)
     collided = sum(agent.collided for agent in agents)
     effort = sum(agent.effort for agent in agents) / len(agents)
-    text = f"{policy_label(panel.case.policy, LONGEST_LABEL)}: {arrived}/{len(agents)} arrived"
+    text = f"{policy_label(panel.case.policy, LONGEST_LABEL)}\n{arrived}/{len(agents)} arrived"
     if panel.world.error is not None:
         return f"{text}, raised an exception"
     if panel.world.planned is False:
         return f"{text}, no plan"
-    return f"{text}, {collided} collided, effort {effort:.2f}"
+    return f"{text}, {collided} collided, effort {effort:.2f} N²s"
 
 
 def _draw_world(axes: Axes, scene: Scene) -> None:

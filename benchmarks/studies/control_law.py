@@ -33,7 +33,12 @@ from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.dynamics import hold_step
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds, episode_streams
-from lagros_policies.contraction import InfeasibleError, Metric, robust_control
+from lagros_policies.contraction import (
+    InfeasibleError,
+    Metric,
+    extreme_eigenvalues,
+    robust_control,
+)
 from lagros_policies.expert import CartPoleExpert, TrackedPlans
 from lagros_policies.metric_design import MetricDesignSettings, design_cartpole_metric
 
@@ -131,7 +136,7 @@ def study(count: int, rates: tuple[float, ...] = _RATES) -> list[dict[str, Any]]
         expert = CartPoleExpert(metric)
         flown = flown or episodes(expert, count)
         plans, pushes = flown
-        least, largest = metric.extreme_eigenvalues()
+        least, largest = extreme_eigenvalues(metric)
         common = {
             "alpha": rate,
             "chi": metric.condition_bound,

@@ -20,7 +20,7 @@ import json
 import math
 import time
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +32,12 @@ from lagros_benchmarks.metrics import wilson_interval
 from lagros_envs import cartpole_task as task
 from lagros_envs.files import write_atomic
 from lagros_policies.contraction import (
+    ContractionMetric,
     HeldControl,
-    Metric,
     Region,
     Samples,
     contraction_residual,
+    extreme_eigenvalues,
     load_metric,
     verify_metric,
 )
@@ -73,14 +74,16 @@ def train(pool: Samples, settings: task.CartPoleSettings) -> tuple[NeuralMetric,
     }
 
 
-def certificate(metric: Metric, fresh: Samples, settings: task.CartPoleSettings) -> dict[str, Any]:
+def certificate(
+    metric: ContractionMetric, fresh: Samples, settings: task.CartPoleSettings
+) -> dict[str, Any]:
     """Return what was observed of a metric's conditions on fresh triples."""
     residual = contraction_residual(settings.system, metric, fresh)
     law = HeldControl(settings.system, metric, metric.contraction_rate, settings.control_period)
     a, b, c = law.quadratic(fresh.state, fresh.nominal, fresh.nominal_control)
     feasible = b * b - a * c >= 0.0
     holds = int(np.sum(residual <= 0.0))
-    least, largest = metric.extreme_eigenvalues()
+    least, largest = extreme_eigenvalues(metric)
     return {
         "alpha": metric.contraction_rate,
         "chi": metric.condition_bound,
@@ -95,7 +98,7 @@ def certificate(metric: Metric, fresh: Samples, settings: task.CartPoleSettings)
     }
 
 
-def closed_loop(metric: Metric, episodes: Episodes) -> dict[str, dict[str, Any]]:
+def closed_loop(metric: ContractionMetric, episodes: Episodes) -> dict[str, dict[str, Any]]:
     """Fly u* with a metric, by least norm and with the preferred feedback."""
     expert = CartPoleExpert(metric)
     plans = expert.track(episodes.states, episodes.controls)
@@ -114,7 +117,7 @@ def closed_loop(metric: Metric, episodes: Episodes) -> dict[str, dict[str, Any]]
     return found
 
 
-def evaluation_time(metric: Metric) -> float:
+def evaluation_time(metric: ContractionMetric) -> float:
     """Return the median time of M and dM/dt of one state [s]."""
     state, times = np.array([0.0, 0.4, 0.2, -0.5]), np.empty(400)
     for call in range(len(times)):
@@ -134,10 +137,12 @@ def study(count: int, weights: Path | None) -> list[dict[str, Any]]:
     if weights is not None:
         pool = tube_samples(design, settings, _DESIGN, _POOL)
         trained, spent = train(pool, settings)
-        checked = verify_metric(settings.system, cast(Metric, trained), fresh, design.seed)
-        save_neural_metric(cast(NeuralMetric, checked), weights)
-    neural = cast(Metric, load_neural_metric(weights))
-    metrics: dict[str, Metric] = {"neural": neural, "degree 4 (shipped)": load_metric()}
+        checked = verify_metric(settings.system, trained, fresh, design.seed)
+        save_neural_metric(checked, weights)
+    metrics: dict[str, ContractionMetric] = {
+        "neural": load_neural_metric(weights),
+        "degree 4 (shipped)": load_metric(),
+    }
     rows = []
     episodes = plan_episodes(CartPoleExpert(), count, _NAMESPACE)
     for name, metric in metrics.items():

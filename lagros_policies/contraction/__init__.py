@@ -12,15 +12,18 @@ from lagros_policies.contraction.cvstem import (
     verify_metric,
 )
 from lagros_policies.contraction.metric import (
+    ContractionMetric,
     Metric,
     Region,
     Verification,
+    extreme_eigenvalues,
     load_metric,
     save_metric,
 )
 from lagros_policies.contraction.tube import Tube, certified_tube, diverging_bound, tighten
 
 __all__ = [
+    "ContractionMetric",
     "CvStemSettings",
     "HeldControl",
     "InfeasibleError",
@@ -34,6 +37,7 @@ __all__ = [
     "design_metric",
     "design_on_pool",
     "diverging_bound",
+    "extreme_eigenvalues",
     "load_metric",
     "robust_control",
     "save_metric",

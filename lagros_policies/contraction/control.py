@@ -14,7 +14,7 @@ from lagros_envs.dynamics import (
     hold_step,
     vector_field,
 )
-from lagros_policies.contraction.metric import Metric
+from lagros_policies.contraction.metric import ContractionMetric
 
 FloatArray = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ def error_energy(matrix: FloatArray, error: FloatArray) -> FloatArray:
 
 def contraction_terms(
     system: System,
-    metric: Metric,
+    metric: ContractionMetric,
     rate: float,
     state: FloatArray,
     nominal: FloatArray,
@@ -61,7 +61,7 @@ def contraction_terms(
 
 def robust_control(
     system: System,
-    metric: Metric,
+    metric: ContractionMetric,
     rate: float,
     state: FloatArray,
     nominal: FloatArray,
@@ -116,7 +116,7 @@ class HeldControl:
     """
 
     system: System
-    metric: Metric
+    metric: ContractionMetric
     rate: float
     period: float
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,15 +24,30 @@ from scipy import sparse
 from lagros_envs.dynamics import System, control_matrix, state_dependent_coefficient
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.metric import (
+    ContractionMetric,
+    DualMetric,
     Metric,
     Region,
     Verification,
     basis,
     basis_rate,
 )
+from lagros_policies.contraction.semidefinite import (
+    ConeProgram,
+    cone_rows,
+    solve_cones,
+    svec,
+    symmetric_basis,
+)
 
 FloatArray = NDArray[np.float64]
+Verified = TypeVar("Verified", bound=ContractionMetric)
 
+# Their names before they had a module of their own; `proof.program` still imports these.
+_Problem = ConeProgram
+_block = cone_rows
+_svec = svec
+_symmetric_basis = symmetric_basis
 
 # Angles at which I <= W_bar(theta) <= chi I is imposed.
 _BOUND_ANGLES = 25
@@ -116,7 +131,7 @@ def design_metric(
         RuntimeError: The solver stopped for another reason.
     """
     problem = _assemble(system, samples, region, settings)
-    values, status = _solve(problem)
+    values, status = solve_cones(problem)
     if status in ("PrimalInfeasible", "AlmostPrimalInfeasible"):
         raise InfeasibleError(
             f"no contraction metric of degree {settings.degree} with "
@@ -243,7 +258,7 @@ def search_rate(
     return best, curve
 
 
-def contraction_residual(system: System, metric: Metric, samples: Samples) -> FloatArray:
+def contraction_residual(system: System, metric: DualMetric, samples: Samples) -> FloatArray:
     """Return by how much the condition fails at each sample, relative to W_bar, shape (s,).
 
     The largest eigenvalue of W_bar^-1/2 (-dW_bar/dt + 2 sym(A W_bar) - 2 nu B B'
@@ -259,7 +274,7 @@ def contraction_residual(system: System, metric: Metric, samples: Samples) -> Fl
     return np.asarray(np.linalg.eigvalsh(relative)[..., -1], dtype=np.float64)
 
 
-def verify_metric(system: System, metric: Metric, samples: Samples, seed: int) -> Metric:
+def verify_metric(system: System, metric: Verified, samples: Samples, seed: int) -> Verified:
     """Check the condition and I <= W_bar <= chi I on fresh samples and store the outcome.
 
     Args:
@@ -280,11 +295,10 @@ def verify_metric(system: System, metric: Metric, samples: Samples, seed: int) -
         eigenvalues[:, -1] <= metric.condition_bound + slack
     )
     broken = int(np.sum((residual > 0.0) | ~bounded))
-    check = Verification(len(residual), broken, float(residual.max()), seed)
-    return replace(metric, verification=check)
+    return metric.verified(Verification(len(residual), broken, float(residual.max()), seed))
 
 
-def _condition(system: System, metric: Metric, samples: Samples) -> FloatArray:
+def _condition(system: System, metric: DualMetric, samples: Samples) -> FloatArray:
     slope = state_dependent_coefficient(
         system, samples.state, samples.nominal, samples.nominal_control
     )
@@ -301,39 +315,9 @@ def _condition(system: System, metric: Metric, samples: Samples) -> FloatArray:
     return left
 
 
-@dataclass(frozen=True)
-class _Problem:
-    """min cost'z subject to right - rows z in a product of semidefinite cones of size n."""
-
-    cost: FloatArray
-    rows: sparse.csc_matrix
-    right: FloatArray
-    cones: int
-    n: int
-    symmetric: FloatArray  # basis of the symmetric matrices, (n(n+1)/2, n, n)
-
-
-def _symmetric_basis(n: int) -> FloatArray:
-    places = [(i, j) for j in range(n) for i in range(j + 1)]
-    matrices = np.zeros((len(places), n, n))
-    for index, (i, j) in enumerate(places):
-        matrices[index, i, j] = matrices[index, j, i] = 1.0
-    return matrices
-
-
-def _svec(matrices: FloatArray) -> FloatArray:
-    """Stack upper triangles by columns, off-diagonals times sqrt(2): Clarabel's cone order."""
-    n = matrices.shape[-1]
-    rows = np.concatenate([np.arange(j + 1) for j in range(n)])
-    columns = np.concatenate([np.full(j + 1, j) for j in range(n)])
-    weight = np.where(rows == columns, 1.0, math.sqrt(2.0))
-    stacked: FloatArray = matrices[..., rows, columns] * weight
-    return stacked
-
-
 def _assemble(
     system: System, samples: Samples, region: Region, settings: CvStemSettings
-) -> _Problem:
+) -> ConeProgram:
     scale = np.asarray(settings.scaling)
     slope = state_dependent_coefficient(
         system, samples.state, samples.nominal, samples.nominal_control
@@ -341,7 +325,7 @@ def _assemble(
     slope = slope * scale[:, None] / scale[None, :]
     gain = control_matrix(system, samples.state) * scale[:, None]
     n = scale.size
-    symmetric = _symmetric_basis(n)
+    symmetric = symmetric_basis(n)
     angle, rate = samples.state[:, ANGLE], samples.state[:, ANGULAR_RATE]
     powers = basis(angle, settings.degree)
     power_rates = basis_rate(angle, rate, settings.degree)
@@ -352,53 +336,19 @@ def _assemble(
     by_dual = powers[:, :, None, None, None] * (both + decay * symmetric)[:, None]
     by_dual -= power_rates[:, :, None, None, None] * symmetric
     by_weight = -2.0 * gain @ np.swapaxes(gain, -1, -2)
-    blocks = [_block(by_dual, by_weight, None)]
+    blocks = [cone_rows(by_dual, by_weight, None)]
     rights = [np.zeros(blocks[0].shape[0])]
     # The bounds depend on the angle alone, which a grid covers; a constant metric needs one point.
     grid = np.linspace(0.0, region.angle, _BOUND_ANGLES if settings.degree else 1)
     bound_powers = basis(grid, settings.degree)
     spread = bound_powers[:, :, None, None, None] * symmetric
     unit = np.broadcast_to(np.eye(n), (len(bound_powers), n, n))
-    blocks.append(_block(-spread, None, None))
-    rights.append(-_svec(unit).ravel())
-    blocks.append(_block(spread, None, -unit))
+    blocks.append(cone_rows(-spread, None, None))
+    rights.append(-svec(unit).ravel())
+    blocks.append(cone_rows(spread, None, -unit))
     rights.append(np.zeros(blocks[-1].shape[0]))
     cost = np.zeros(by_dual.shape[1] * by_dual.shape[2] + 2)
     cost[-2:] = settings.control_penalty, 1.0
     rows = sparse.csc_matrix(np.vstack(blocks))
     cones = len(samples.state) + 2 * len(bound_powers)
-    return _Problem(cost, rows, np.concatenate(rights), cones, n, symmetric)
-
-
-def _block(
-    by_dual: FloatArray, by_weight: FloatArray | None, by_condition: FloatArray | None
-) -> FloatArray:
-    """Rows of one family of cones: columns for every W_ij, then nu, then chi."""
-    count = len(by_dual)
-    dual = _svec(by_dual)
-    height = dual.shape[-1]
-    dual = np.moveaxis(dual, -1, 1).reshape(count * height, -1)
-    zero = np.zeros((count * height, 1))
-    weight = zero if by_weight is None else _svec(by_weight).reshape(-1, 1)
-    condition = zero if by_condition is None else _svec(by_condition).reshape(-1, 1)
-    return np.hstack([dual, weight, condition])
-
-
-def _solve(problem: _Problem) -> tuple[FloatArray | None, str]:
-    import clarabel
-
-    settings: Any = clarabel.DefaultSettings()
-    settings.verbose = False
-    settings.max_threads = 1
-    cones = [clarabel.PSDTriangleConeT(problem.n)] * problem.cones
-    size = problem.cost.size
-    quadratic = sparse.csc_matrix((size, size))
-    solver = clarabel.DefaultSolver(
-        quadratic, problem.cost, problem.rows, problem.right, cones, settings
-    )
-    answer = solver.solve()
-    status = str(answer.status)
-    # An almost solved program is accepted only because every metric is verified afterwards.
-    if status not in ("Solved", "AlmostSolved"):
-        return None, status
-    return np.array(answer.x), status
+    return ConeProgram(cost, rows, np.concatenate(rights), cones, n, symmetric)

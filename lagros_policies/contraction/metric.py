@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +90,53 @@ class Verification:
     seed: int
 
 
+class DualMetric(Protocol):
+    """W_bar(x) and its rate: what the condition of Theorem 2 asks of a metric."""
+
+    @property
+    def contraction_rate(self) -> float:
+        """The contraction rate alpha [1/s]."""
+
+    @property
+    def control_weight(self) -> float:
+        """nu, the weight of B B' in the condition."""
+
+    def dual(self, state: FloatArray) -> FloatArray:
+        """Return W_bar(x), shape (..., n, n), for states (..., n)."""
+
+    def dual_rate(self, state: FloatArray) -> FloatArray:
+        """Return dW_bar/dt along dtheta/dt of the state, shape (..., n, n)."""
+
+
+class ContractionMetric(DualMetric, Protocol):
+    """A metric of the angle that laws and tubes take: `Metric`, `NeuralMetric` or your own."""
+
+    @property
+    def condition_bound(self) -> float:
+        """chi, with I <= S W_bar S <= chi I up to a common factor."""
+
+    @property
+    def scaling(self) -> FloatArray:
+        """Diagonal of S, the units in which chi is measured, shape (n,)."""
+
+    @property
+    def region(self) -> Region:
+        """Where the metric was designed."""
+
+    @property
+    def verification(self) -> Verification | None:
+        """The independent check, or None."""
+
+    def matrix(self, state: FloatArray) -> FloatArray:
+        """Return M(x), shape (..., n, n), for states (..., n)."""
+
+    def matrix_rate(self, state: FloatArray) -> FloatArray:
+        """Return dM/dt along dtheta/dt of the state, shape (..., n, n)."""
+
+    def verified(self, check: Verification) -> Self:
+        """Return the metric with the outcome of a check."""
+
+
 @dataclass(frozen=True)
 class Metric:
     """W_bar(theta) = sum_i W_i cos(theta)^i, with M = nu W_bar^-1 (Theorem 2).
@@ -142,7 +190,7 @@ class Metric:
 
     def dual(self, state: FloatArray) -> FloatArray:
         """Return W_bar(x), shape (..., n, n), for states (..., n)."""
-        powers = np.cos(state[..., ANGLE])[..., None] ** np.arange(self.degree + 1)
+        powers = basis(state[..., ANGLE], self.degree)
         value: FloatArray = np.einsum("...i,ijk->...jk", powers, self.coefficients)
         return value
 
@@ -164,12 +212,22 @@ class Metric:
         matrix = self.matrix(state)
         return -matrix @ self.dual_rate(state) @ matrix
 
-    def extreme_eigenvalues(self, points: int = 401) -> tuple[float, float]:
-        """Return the extreme eigenvalues of M over a grid of the region's angles (observed)."""
-        states = np.zeros((points, len(self.scaling)))
-        states[:, ANGLE] = np.linspace(0.0, self.region.angle, points)
-        values = np.linalg.eigvalsh(self.matrix(states))
-        return float(values.min()), float(values.max())
+    def verified(self, check: Verification) -> Self:
+        """Return the metric with the outcome of a check."""
+        return replace(self, verification=check)
+
+
+def extreme_eigenvalues(metric: ContractionMetric, points: int = 401) -> tuple[float, float]:
+    """Return the extreme eigenvalues of M over a grid of the region's angles (observed).
+
+    Args:
+        metric: A metric that is even in the angle.
+        points: Angles from 0 to the region's largest.
+    """
+    states = np.zeros((points, len(metric.scaling)))
+    states[:, ANGLE] = np.linspace(0.0, metric.region.angle, points)
+    values = np.linalg.eigvalsh(metric.matrix(states))
+    return float(values.min()), float(values.max())
 
 
 def basis(angle: FloatArray, degree: int) -> FloatArray:
@@ -192,16 +250,41 @@ def metric_record(metric: Metric) -> dict[str, Any]:
         "format": _FORMAT,
         "basis": "cos(theta)^i",
         "coefficients": metric.coefficients.tolist(),
+        **design_record(metric),
+    }
+
+
+def design_record(metric: ContractionMetric) -> dict[str, Any]:
+    """Return what the file of any metric says of its design; numbers keep every bit."""
+    return {
         "alpha": metric.contraction_rate,
         "chi": metric.condition_bound,
         "nu": metric.control_weight,
         "scaling": metric.scaling.tolist(),
-        "region": {name: getattr(metric.region, name) for name in Region.__dataclass_fields__},
-        "verification": None
-        if metric.verification is None
-        else {
-            name: getattr(metric.verification, name) for name in Verification.__dataclass_fields__
-        },
+        "region": asdict(metric.region),
+        "verification": None if metric.verification is None else asdict(metric.verification),
+    }
+
+
+def design_arguments(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of a metric from what `design_record` made.
+
+    Args:
+        record: The record, with any other entries.
+
+    Raises:
+        KeyError: An entry is missing.
+        TypeError: An entry has a wrong type.
+        ValueError: A number is out of range.
+    """
+    check = record["verification"]
+    return {
+        "contraction_rate": float(record["alpha"]),
+        "condition_bound": float(record["chi"]),
+        "control_weight": float(record["nu"]),
+        "scaling": np.array(record["scaling"], dtype=np.float64),
+        "region": Region(**record["region"]),
+        "verification": None if check is None else Verification(**check),
     }
 
 
@@ -229,15 +312,7 @@ def load_metric(path: Path | str | None = None) -> Metric:
         record = json.loads(Path(path).read_text())
         if record["format"] != _FORMAT:
             raise ValueError(f"format {record['format']!r} is not {_FORMAT!r}")
-        check = record["verification"]
-        return Metric(
-            coefficients=np.array(record["coefficients"], dtype=np.float64),
-            contraction_rate=float(record["alpha"]),
-            condition_bound=float(record["chi"]),
-            control_weight=float(record["nu"]),
-            scaling=np.array(record["scaling"], dtype=np.float64),
-            region=Region(**record["region"]),
-            verification=None if check is None else Verification(**check),
-        )
+        coefficients = np.array(record["coefficients"], dtype=np.float64)
+        return Metric(coefficients, **design_arguments(record))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not a metric written by save_metric: {error}") from error

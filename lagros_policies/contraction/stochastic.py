@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from lagros_envs.dynamics import System, hold_step
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.double_integrator import AxisMetric
-from lagros_policies.contraction.metric import Metric
+from lagros_policies.contraction.metric import ContractionMetric
 
 FloatArray = NDArray[np.float64]
 
@@ -88,7 +88,7 @@ def checked_intensity(intensity: Any, size: int) -> FloatArray:
 
 
 def mean_square_bound(
-    metric: Metric, intensity: Any, initial_energy: float = 0.0
+    metric: ContractionMetric, intensity: Any, initial_energy: float = 0.0
 ) -> MeanSquareBound:
     """Return the bound for a metric of the angle, for a control at will.
 
@@ -96,7 +96,7 @@ def mean_square_bound(
     the state stays in the region: noise leaves any region at some time, if rarely.
 
     Args:
-        metric: A `Metric` or whatever has its calls.
+        metric: A metric of the angle.
         intensity: g, shape (4,) [unit of the state / sqrt(s)].
         initial_energy: V(0).
 
@@ -131,7 +131,9 @@ def mean_square_bound(
     return MeanSquareBound(float(rates[best]), float(powers[best]), least, initial_energy)
 
 
-def _variation(metric: Metric, states: FloatArray, matrix: FloatArray) -> tuple[float, float]:
+def _variation(
+    metric: ContractionMetric, states: FloatArray, matrix: FloatArray
+) -> tuple[float, float]:
     """Return mu_1 and mu_2 over the grid."""
     slope = metric.matrix_rate(states)  # the states turn at 1 rad/s
     ahead, behind = states.copy(), states.copy()

@@ -37,7 +37,7 @@ from lagros_envs.dynamics import (
 )
 from lagros_policies.contraction.control import contraction_terms
 from lagros_policies.contraction.cvstem import Samples
-from lagros_policies.contraction.metric import Metric
+from lagros_policies.contraction.metric import DualMetric, Metric
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.proof.intervals import Interval, exact, negative_definite
 from lagros_policies.contraction.proof.motion import accelerations, jacobian_parts, metric_series
@@ -155,7 +155,7 @@ def lipschitz_constant(system: CartPole, box: ProofBox, cells: int = 2000) -> Li
 
 
 def gain_residual(
-    system: System, metric: Metric, samples: Samples, share: float = 1.0
+    system: System, metric: DualMetric, samples: Samples, share: float = 1.0
 ) -> FloatArray:
     """Return the largest eigenvalue of Theorem 2's condition for K = -share B'M, shape (s,).
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_policies.contraction.metric import Metric
+from lagros_policies.contraction.metric import ContractionMetric, extreme_eigenvalues
 
 FloatArray = NDArray[np.float64]
 
@@ -65,15 +65,18 @@ class Tube:
 
 
 def certified_tube(
-    metric: Metric,
+    metric: ContractionMetric,
     disturbance_bound: float,
     learning_error: float = 0.0,
     control_gain: float = 0.0,
 ) -> Tube:
     """Return the tube of Theorem 1 from a metric's own alpha and condition number.
 
-    It bounds the continuous-time loop while the state stays in the metric's region; the metric's
-    condition was checked on samples, so the bound is observed, not proved.
+    It bounds the continuous-time loop while the state stays in the metric's region and the
+    disturbance does not move M; the metric's condition was checked on samples, so the bound is
+    observed, not proved. Where the disturbance moves the angle, and M depends on it, the theorem
+    leaves out a term: what follows then has `theorems.disturbed_rate` in alpha's place, and nothing
+    follows where that is not positive.
 
     Args:
         metric: The contraction metric.
@@ -84,7 +87,7 @@ def certified_tube(
     Returns:
         The tube in the Euclidean norm of the state.
     """
-    least, largest = metric.extreme_eigenvalues()
+    least, largest = extreme_eigenvalues(metric)
     return Tube(
         metric.contraction_rate, largest / least, disturbance_bound, learning_error, control_gain
     )

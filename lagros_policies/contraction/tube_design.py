@@ -29,8 +29,9 @@ from scipy import sparse
 
 from lagros_envs.dynamics import System, control_matrix, jacobian
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
-from lagros_policies.contraction.cvstem import InfeasibleError, _svec, _symmetric_basis
+from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.proof.condition import ProofBox
+from lagros_policies.contraction.semidefinite import svec, symmetric_basis
 
 FloatArray = NDArray[np.float64]
 Method = Literal["paper", "output", "ellipsoid"]
@@ -300,7 +301,7 @@ def _solve(
     import clarabel
 
     n = slope.shape[-1]
-    basis = _symmetric_basis(n)
+    basis = symmetric_basis(n)
     size = len(basis)
     product = np.einsum("sab,jbc->sjac", slope, basis)
     by_dual = product + np.swapaxes(product, -1, -2)
@@ -310,15 +311,15 @@ def _solve(
     floor = design.floor * design.source if design.method == "ellipsoid" else 1.0
     # Rows z + slack = right, slack in a cone: (W, nu, t) in columns.
     blocks = [
-        np.column_stack([_svec(part).T, _svec(push), np.zeros(size)])
+        np.column_stack([svec(part).T, svec(push), np.zeros(size)])
         for part, push in zip(by_dual, by_weight, strict=True)
     ]
-    rights = [-_svec(design.source * eye)] * len(slope)
-    blocks.append(np.column_stack([-_svec(basis).T, np.zeros((size, 2))]))
-    rights.append(-floor * _svec(eye))
+    rights = [-svec(design.source * eye)] * len(slope)
+    blocks.append(np.column_stack([-svec(basis).T, np.zeros((size, 2))]))
+    rights.append(-floor * svec(eye))
     cones: list[Any] = [clarabel.PSDTriangleConeT(n)] * (len(slope) + 1)
     if design.output is None:
-        blocks.append(np.column_stack([_svec(basis).T, np.zeros(size), -_svec(eye)]))
+        blocks.append(np.column_stack([svec(basis).T, np.zeros(size), -svec(eye)]))
         rights.append(np.zeros(size))
         cones.append(clarabel.PSDTriangleConeT(n))
     else:

@@ -223,11 +223,15 @@ class _CartPoleExpert:
     """One plan of the whole episode, tracked with u*."""
 
     def __init__(self, env: Any) -> None:
+        from lagros_policies.contraction import load_metric
         from lagros_policies.tube_mpc import TubeMpcPolicy
 
         self._task = env.settings
+        self._metric = load_metric()
         # A failed plan is asked for again at the next step, as policy (b) does.
-        self._policy = TubeMpcPolicy(env.settings, replan_every=self._task.steps, deadline=math.inf)
+        self._policy = TubeMpcPolicy(
+            env.settings, self._metric, replan_every=self._task.steps, deadline=math.inf
+        )
 
     def act(
         self, env: Environment, observation: Float32Array, state: PolicyState
@@ -247,8 +251,7 @@ class _CartPoleExpert:
         return {name: counted[name] for name in ("plans", "failed_plans")}
 
     def record(self) -> dict[str, Any]:
-        expert = self._policy.expert
-        metric = expert.metric
+        expert, metric = self._policy.expert, self._metric
         check = metric.verification
         return {
             "metric": {

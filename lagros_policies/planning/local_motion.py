@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_policies.planning.vectors import lengths
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
@@ -150,11 +152,4 @@ def required_distances(
     room = np.where(discs.moving & (left > 0.0), np.inf, room)
     remaining = np.maximum(left - times, 0.0)
     value: FloatArray = np.minimum(required, room + growth * remaining[:, None] ** 2)
-    return value
-
-
-def lengths(vectors: FloatArray) -> FloatArray:
-    """Return the lengths (...) of vectors (..., 2); several times as fast as NumPy's norm."""
-    x, y = vectors[..., 0], vectors[..., 1]
-    value: FloatArray = np.sqrt(x * x + y * y)
     return value

@@ -24,13 +24,8 @@ from lagros_policies.planning.grid_path import (
     walk,
 )
 from lagros_policies.planning.joint_plan import JointPlan, divisor, instants, swept_distances
-from lagros_policies.planning.joint_scp import (
-    JointProblem,
-    JointScpSettings,
-    JointSolution,
-    positions_between,
-    solve_joint,
-)
+from lagros_policies.planning.joint_problem import JointProblem, JointScpSettings
+from lagros_policies.planning.joint_scp import JointSolution, positions_between, solve_joint
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

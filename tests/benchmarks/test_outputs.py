@@ -176,7 +176,24 @@ def test_the_error_figure_takes_what_json_made_of_the_rows(rows, tmp_path):
 def test_the_success_figure_is_drawn(grid_rows, tmp_path):
     path = figures.draw(grid_rows, tmp_path / "grid.png")
     height, width = matplotlib.image.imread(path).shape[:2]
-    assert (width, height) == (1170, 825)
+    assert (width, height) == (1560, 480)
+
+
+@pytest.mark.parametrize("count", range(1, 9))
+def test_one_place_of_the_success_figure_stays_empty_at_most(grid_rows, monkeypatch, count):
+    drawn = []
+    monkeypatch.setattr(figures, "save", lambda figure, _: drawn.append(figure))
+    kinds = [f"kind {number}" for number in range(count)]
+    rows = [{**row, "disturbance": kind} for row in grid_rows[:4] for kind in kinds]
+    figures.grid_figure(rows, "grid.png")
+    (figure,) = drawn
+    shown = [axes for axes in figure.axes if axes.axison]
+    assert [axes.get_title("left") for axes in shown] == kinds
+    assert len(figure.axes) - count <= 1
+    legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes if axes.get_legend())]
+    names = [[text.get_text() for text in legend.get_texts()] for legend in legends]
+    policies = dict.fromkeys(row["policy"] for row in rows)
+    assert names == [[formats.policy_label(name, 24) for name in policies]]
 
 
 @pytest.mark.parametrize("suffix", ["pdf", "svg"])

@@ -7,12 +7,12 @@ import filecmp
 import numpy as np
 import pytest
 
-from lagros_benchmarks.reproduce import ReproduceSettings, reproduce_cartpole
+from lagros_benchmarks.reproduce import ReproduceSettings
 from lagros_benchmarks.reproduce_spacecraft import (
     SpacecraftReproduceSettings,
-    reproduce_spacecraft,
     training_part,
 )
+from lagros_benchmarks.reproduction import reproduce
 from lagros_benchmarks.runner import run_benchmark
 from lagros_envs.observation import Layout
 from lagros_policies.imitation.dataset import ExpertDataSettings
@@ -49,16 +49,16 @@ def small(**changes):
 
 @pytest.mark.slow
 def test_an_interrupted_run_ends_with_the_files_of_one_that_was_not(tmp_path):
-    benchmark = reproduce_cartpole(tmp_path / "whole", small())
+    benchmark = reproduce(tmp_path / "whole", small())
 
     def stop_in_training(title, done, total):
         if title == "train lagros" and done == 2:
             raise InterruptedRunError
 
     with pytest.raises(InterruptedRunError):
-        reproduce_cartpole(tmp_path / "broken", small(), progress=stop_in_training)
+        reproduce(tmp_path / "broken", small(), progress=stop_in_training)
     assert not (tmp_path / "broken" / "cartpole_lagros.safetensors").exists()
-    reproduce_cartpole(tmp_path / "broken", small())
+    reproduce(tmp_path / "broken", small())
     same, different, missing = filecmp.cmpfiles(
         tmp_path / "whole", tmp_path / "broken", FILES, shallow=False
     )
@@ -70,7 +70,7 @@ def test_an_interrupted_run_ends_with_the_files_of_one_that_was_not(tmp_path):
 
     other = TrainingSettings(hidden=(16,), epochs=5)
     with pytest.raises(ValueError, match="other settings"):
-        reproduce_cartpole(tmp_path / "whole", small(lagros=other))
+        reproduce(tmp_path / "whole", small(lagros=other))
 
 
 SPACECRAFT_FILES = tuple(
@@ -103,16 +103,16 @@ def small_spacecraft():
 
 @pytest.mark.slow
 def test_the_spacecraft_run_is_resumed_and_ends_with_the_same_files(tmp_path):
-    benchmark = reproduce_spacecraft(tmp_path / "whole", small_spacecraft())
+    benchmark = reproduce(tmp_path / "whole", small_spacecraft())
 
     def stop_in_flight(title, done, total):
         if title == "relabelled1" and done == 1:
             raise InterruptedRunError
 
     with pytest.raises(InterruptedRunError):
-        reproduce_spacecraft(tmp_path / "broken", small_spacecraft(), stop_in_flight)
+        reproduce(tmp_path / "broken", small_spacecraft(), stop_in_flight)
     assert not (tmp_path / "broken" / "spacecraft_lagros.safetensors").exists()
-    reproduce_spacecraft(tmp_path / "broken", small_spacecraft())
+    reproduce(tmp_path / "broken", small_spacecraft())
     same, different, missing = filecmp.cmpfiles(
         tmp_path / "whole", tmp_path / "broken", SPACECRAFT_FILES, shallow=False
     )

@@ -17,6 +17,7 @@ from rich.text import Text
 from typer.testing import CliRunner
 
 from lagros_benchmarks import cli, figures, files, formats, tables
+from lagros_benchmarks.canvas import save
 from lagros_benchmarks.records import summarise
 from lagros_benchmarks.runner import fly_scene, run_benchmark
 from lagros_benchmarks.scene_figure import scene_figure
@@ -225,7 +226,14 @@ def test_a_row_without_numbers_can_be_drawn(sweep, tmp_path):
     assert figures.draw(rows[:8], tmp_path / "one.pdf").stat().st_size > 5_000
 
 
-def test_the_scene_is_drawn(tmp_path):
+def test_the_scene_is_drawn(tmp_path, monkeypatch):
+    titles = []
+
+    def write(figure, path):
+        titles.extend(axes.get_title("left") for axes in figure.axes if axes.axison)
+        return save(figure, path)
+
+    monkeypatch.setattr("lagros_benchmarks.scene_figure.write", write)
     settings = BenchmarkSettings.for_task(
         "spacecraft",
         policies=("lagros", "centralized", "learned"),
@@ -240,6 +248,9 @@ def test_the_scene_is_drawn(tmp_path):
     assert (0x00, 0x72, 0xB2) in colours
     collided = any(a.collided for panel in scene.panels for a in panel.world.agents)
     assert ((0xB0, 0x00, 0x20) in colours) == collided
+    for title, panel in zip(titles, scene.panels, strict=True):
+        efforts = [agent.effort for agent in panel.world.agents]
+        assert title.endswith(f"effort {np.mean(efforts):.2f} N²s")
     with pytest.raises(ValueError, match="must end in"):
         scene_figure(scene, tmp_path / "scene.gif")
 

@@ -10,7 +10,7 @@ from lagros_envs.scenarios import Scenario
 
 pygame = pytest.importorskip("pygame")
 
-from lagros_envs.rendering import BLUE, VERMILLION  # noqa: E402
+from lagros_envs.canvas import BLUE, VERMILLION  # noqa: E402
 from lagros_envs.spacecraft_rendering import BORDER, PANEL, VIEW  # noqa: E402
 
 STILL = np.zeros(8)

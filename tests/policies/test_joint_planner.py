@@ -19,7 +19,7 @@ from lagros_policies.planning.grid_path import (
     walk,
 )
 from lagros_policies.planning.joint_plan import fly, swept_distances
-from lagros_policies.planning.joint_scp import JointScpSettings
+from lagros_policies.planning.joint_problem import JointScpSettings
 from lagros_policies.planning.qp import QpSolution
 from lagros_policies.planning.spacecraft import SpacecraftPlanner, SpacecraftPlannerSettings
 

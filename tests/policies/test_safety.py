@@ -3,10 +3,7 @@
 import dataclasses
 
 import numpy as np
-import osqp
 import pytest
-from scipy import sparse
-from scipy.optimize import linprog
 
 from lagros_envs import spacecraft_v0
 from lagros_envs.dynamics.spacecraft import Spacecraft
@@ -16,10 +13,10 @@ from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
 from lagros_policies.barrier import BarrierSettings, BrakingBarrier
 from lagros_policies.contraction.thrusters import allocate
-from lagros_policies.half_planes import nearest
 from lagros_policies.policy import Policy
 from lagros_policies.safety import FilterState, SafetyFilter
 from lagros_policies.sensed import Sensed
+from tests.policies.programs import least_violation_by_program, nearest_by_program
 
 PERIOD = 0.1
 BODY = Spacecraft()
@@ -99,105 +96,6 @@ def situations(layout, count, seed, near=0.9):
         rows[:, at[f"{part}s"]] = stacked.reshape(count, -1)
         rows[:, at[f"{part}_mask"]] = mask
     return rows.astype(np.float32)
-
-
-def half_planes_of(rng, kind):
-    """Return normals, bounds and a wanted point of one random problem."""
-    count = int(rng.integers(1, 9))
-    angle = rng.uniform(-np.pi, np.pi, count)
-    normals = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    if kind == "opposite" and count > 1:
-        normals[1] = -normals[0]
-    bounds = rng.normal(size=count) - (1.0 if kind == "open" else 0.0)
-    return normals, bounds, 2.0 * rng.normal(size=2)
-
-
-def least_violation_by_program(normals, bounds, soft):
-    """Return min t with n'a + soft t >= b, by a general solver."""
-    answer = linprog(
-        [0.0, 0.0, 1.0],
-        A_ub=-np.column_stack([normals, soft]),
-        b_ub=-bounds,
-        bounds=[(None, None), (None, None), (0.0, None)],
-    )
-    assert answer.status == 0
-    return answer.fun
-
-
-def nearest_by_program(wanted, normals, bounds):
-    """Return the nearest point by OSQP."""
-    solver = osqp.OSQP()
-    solver.setup(
-        sparse.eye(2, format="csc"),
-        -wanted,
-        sparse.csc_matrix(normals),
-        bounds,
-        np.full(len(bounds), np.inf),
-        verbose=False,
-        eps_abs=1e-9,
-        eps_rel=1e-9,
-        max_iter=100_000,
-    )
-    return solver.solve(raise_error=True).x
-
-
-@pytest.mark.parametrize("kind", ["open", "any", "opposite"])
-def test_nearest_is_that_of_osqp_and_of_a_linear_program(kind):
-    rng = np.random.default_rng(3)
-    infeasible = 0
-    for _ in range(80):
-        normals, bounds, wanted = half_planes_of(rng, kind)
-        point, violation = nearest(wanted[None], normals[None], bounds[None])
-        least = least_violation_by_program(normals, bounds, np.ones(len(bounds)))
-        assert violation[0] == pytest.approx(least, abs=1e-7)
-        assert np.all(normals @ point[0] >= bounds - least - 1e-6)
-        if least == 0.0:
-            expected = nearest_by_program(wanted, normals, bounds)
-            assert point[0] == pytest.approx(expected, abs=1e-5)
-        infeasible += least > 1e-6
-    assert infeasible > 10 or kind == "open"
-
-
-def test_what_is_least_violated_is_nearest_among_its_equals():
-    # Between two walls that ask for too much, the middle, and as far along them as was wanted.
-    normals = np.array([[[1.0, 0.0], [-1.0, 0.0]]])
-    point, violation = nearest(np.array([[5.0, 7.0]]), normals, np.array([[2.0, 1.0]]))
-    assert violation[0] == pytest.approx(1.5)
-    assert point[0] == pytest.approx([0.5, 7.0], abs=1e-6)
-
-
-def test_the_violation_is_shared_by_softness_and_the_hard_take_none():
-    rng = np.random.default_rng(4)
-    box = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    violated = 0
-    for _ in range(60):
-        normals, bounds, wanted = half_planes_of(rng, "any")
-        together = np.concatenate([normals, box])
-        limits = np.concatenate([bounds, np.full(4, -0.7)])
-        softness = np.concatenate([rng.choice([0.3, 1.0], len(bounds)), np.zeros(4)])
-        point, violation = nearest(wanted[None], together[None], limits[None], softness)
-        least = least_violation_by_program(together, limits, softness)
-        assert violation[0] == pytest.approx(least, abs=1e-6)
-        assert np.all(together @ point[0] >= limits - softness * least - 1e-6)
-        violated += least > 1e-6
-    assert violated > 10
-
-
-def test_rows_are_independent_and_absent_half_planes_do_nothing():
-    rng = np.random.default_rng(5)
-    problems = [half_planes_of(rng, "any") for _ in range(50)]
-    normals, bounds = np.zeros((50, 9, 2)), rng.normal(size=(50, 9))
-    for row, (some, limits, _) in enumerate(problems):
-        normals[row, : len(limits)], bounds[row, : len(limits)] = some, limits
-    wanted = np.array([point for _, _, point in problems])
-    points, violation = nearest(wanted, normals, bounds)
-    for row, (some, limits, point) in enumerate(problems):
-        alone = nearest(point[None], some[None], limits[None])
-        assert points[row] == pytest.approx(alone.points[0], abs=1e-6)
-        assert violation[row] == pytest.approx(alone.violation[0], abs=1e-6)
-    nothing = nearest(wanted, np.zeros((50, 3, 2)), np.ones((50, 3)))
-    assert np.array_equal(nothing.points, wanted)
-    assert not nothing.violation.any()
 
 
 def filter_of(action, preset="paper", agents=6, settings=None, **arguments):

@@ -21,19 +21,30 @@ CURVE, FINAL = 0x63757276, 0x6C617374
 assert min(EVALUATION, CURVE, FINAL) >= MOST_SEGMENTS
 
 
-def _check_numbers(settings: Any, positive: tuple[str, ...], counts: tuple[str, ...]) -> None:
-    for name in positive:
-        value = getattr(settings, name)
-        if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(f"{name}={value!r} must be finite and > 0")
-    for name in counts:
-        value = getattr(settings, name)
-        if value != int(value) or value < 1:
-            raise ValueError(f"{name}={value!r} must be a whole number >= 1")
+class _Ranged:
+    """Settings whose ranges are checked when they are built."""
+
+    # Names of the attributes that must be finite and positive, and of those that count something.
+    positive: ClassVar[tuple[str, ...]] = ()
+    counts: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in self.positive:
+            _check_positive(name, getattr(self, name))
+        for name in self.counts:
+            value = getattr(self, name)
+            if value != int(value) or value < 1:
+                raise ValueError(f"{name}={value!r} must be a whole number >= 1")
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0.0):
+        raise ValueError(f"{name}={value!r} must be finite and > 0")
 
 
 @dataclass(frozen=True)
-class Ppo:
+class Ppo(_Ranged):
     """Proximal policy optimisation.
 
     Attributes:
@@ -54,6 +65,8 @@ class Ppo:
     """
 
     name: ClassVar[str] = "ppo"
+    positive: ClassVar[tuple[str, ...]] = ("learning_rate", "discount", "clip_range")
+    counts: ClassVar[tuple[str, ...]] = ("rollout_steps", "batch_size", "epochs")
     rollout_steps: int = 90
     batch_size: int = 1440
     epochs: int = 10
@@ -64,17 +77,9 @@ class Ppo:
     initial_log_std: float = -2.0
     hidden: tuple[int, ...] = (64, 64)
 
-    def __post_init__(self) -> None:
-        """Check the values."""
-        _check_numbers(
-            self,
-            ("learning_rate", "discount", "clip_range"),
-            ("rollout_steps", "batch_size", "epochs"),
-        )
-
 
 @dataclass(frozen=True)
-class OffPolicy:
+class OffPolicy(_Ranged):
     """What soft actor-critic and TD3 share: learning from a buffer of all that was met.
 
     Attributes:
@@ -92,6 +97,8 @@ class OffPolicy:
     """
 
     name: ClassVar[str] = ""
+    positive: ClassVar[tuple[str, ...]] = ("learning_rate", "discount", "averaging")
+    counts: ClassVar[tuple[str, ...]] = ("batch_size", "gradient_steps", "buffer_size")
     batch_size: int = 256
     gradient_steps: int = 2
     warm_up: int = 128
@@ -100,14 +107,6 @@ class OffPolicy:
     discount: float = 0.98
     averaging: float = 0.01
     hidden: tuple[int, ...] = (64, 64)
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        _check_numbers(
-            self,
-            ("learning_rate", "discount", "averaging"),
-            ("batch_size", "gradient_steps", "buffer_size"),
-        )
 
 
 @dataclass(frozen=True)
@@ -140,7 +139,7 @@ Algorithm = Ppo | Sac | Td3
 
 
 @dataclass(frozen=True)
-class Training:
+class Training(_Ranged):
     """A training run, besides the task's physics.
 
     Attributes:
@@ -160,6 +159,13 @@ class Training:
     """
 
     task: ClassVar[str] = ""
+    counts: ClassVar[tuple[str, ...]] = (
+        "segments",
+        "segment_steps",
+        "worlds",
+        "curve_episodes",
+        "final_episodes",
+    )
     algorithm: Algorithm = field(default_factory=Ppo)
     seed: int = 0
     segments: int = 20
@@ -173,9 +179,7 @@ class Training:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        _check_numbers(
-            self, (), ("segments", "segment_steps", "worlds", "curve_episodes", "final_episodes")
-        )
+        super().__post_init__()
         if self.seed < 0:
             raise ValueError(f"seed={self.seed!r} must be a non-negative integer")
         if self.segments >= MOST_SEGMENTS:
@@ -235,7 +239,7 @@ class CartPoleTraining(Training):
         """Check the values."""
         super().__post_init__()
         if self.largest_correction is not None:
-            _check_numbers(self, ("largest_correction",), ())
+            _check_positive("largest_correction", self.largest_correction)
 
     @property
     def label(self) -> str:
@@ -262,6 +266,8 @@ class SpacecraftTraining(Training):
     """
 
     task: ClassVar[str] = "spacecraft"
+    positive: ClassVar[tuple[str, ...]] = ("time_limit", "nearness_range")
+    counts: ClassVar[tuple[str, ...]] = (*Training.counts, "agents")
     algorithm: Algorithm = field(
         default_factory=lambda: Ppo(
             rollout_steps=128, batch_size=4608, epochs=5, learning_rate=7e-4
@@ -281,11 +287,6 @@ class SpacecraftTraining(Training):
     nearness_range: float = 0.5
     final_agents: tuple[int, ...] = (3, 6)
     final_bounds: tuple[float, ...] = (0.4,)
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        super().__post_init__()
-        _check_numbers(self, ("time_limit", "nearness_range"), ("agents",))
 
     @property
     def rows(self) -> int:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from lagros_policies.contraction.cvstem import (
     Samples,
     contraction_residual,
 )
-from lagros_policies.contraction.metric import Metric, Region
+from lagros_policies.contraction.metric import Region
 from lagros_policies.contraction.neural.metric import SIZE
 
 FloatArray = NDArray[np.float64]
@@ -35,7 +35,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class AngleSolution:
-    """What CV-STEM found at each angle; `contraction_residual` takes it for a metric.
+    """What CV-STEM found at each angle; a `DualMetric` that `contraction_residual` takes.
 
     Attributes:
         angles: theta_j, ascending from 0, shape (j,) [rad].
@@ -182,7 +182,7 @@ def solve_on_pool(
     active = np.arange(min(first, len(pool.state)))
     while True:
         solution = solve_at_angles(system, pool.take(active), region, settings, angles)
-        residual = contraction_residual(system, cast(Metric, solution), pool)
+        residual = contraction_residual(system, solution, pool)
         rounds -= 1
         if residual.max() <= 0.0 or rounds <= 0:
             return solution

@@ -9,23 +9,29 @@ The network sees cos(theta) alone. Three reasons: the condition of Theorem 2 dep
 and on no speed of the cart; a metric of the angle changes at the rate theta', which needs neither
 the force nor the disturbance; and an even function keeps the symmetry of left and right.
 
-dM/dtheta is computed layer by layer beside M, exactly. `NeuralMetric` has the calls of `Metric`, so
-that `HeldControl`, `robust_control`, `contraction_residual`, `verify_metric` and `certified_tube`
-take it in its place. `design` makes one.
+dM/dtheta is computed layer by layer beside M, exactly. `NeuralMetric` is a
+`ContractionMetric` like `Metric`, so that `HeldControl`, `robust_control`, `contraction_residual`,
+`verify_metric` and `certified_tube` take it in its place. `design` makes one.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
-from lagros_policies.contraction.metric import Region, Verification
+from lagros_policies.contraction.metric import (
+    Region,
+    Verification,
+    design_arguments,
+    design_record,
+)
 from lagros_policies.imitation.networks import Mlp
 
 FloatArray = NDArray[np.float64]
@@ -100,12 +106,9 @@ class NeuralMetric:
         dual = self.dual(state)
         return -dual @ self.matrix_rate(state) @ dual
 
-    def extreme_eigenvalues(self, points: int = 401) -> tuple[float, float]:
-        """Return the extreme eigenvalues of M over a grid of the region's angles (observed)."""
-        states = np.zeros((points, SIZE))
-        states[:, ANGLE] = np.linspace(0.0, self.region.angle, points)
-        values = np.linalg.eigvalsh(self.matrix(states))
-        return float(values.min()), float(values.max())
+    def verified(self, check: Verification) -> Self:
+        """Return the metric with the outcome of a check."""
+        return replace(self, verification=check)
 
     def _factor(self, angle: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return S L and d(S L)/dtheta, both (..., 4, 4), at angles (...)."""
@@ -143,15 +146,7 @@ def feature_slope(angle: FloatArray, region: Region) -> FloatArray:
 
 def save_neural_metric(metric: NeuralMetric, path: Path | str) -> None:
     """Write a metric as safetensors, atomically; its numbers go into the metadata."""
-    record = {
-        "kind": _FORMAT,
-        "alpha": metric.contraction_rate,
-        "chi": metric.condition_bound,
-        "nu": metric.control_weight,
-        "scaling": metric.scaling.tolist(),
-        "region": asdict(metric.region),
-        "verification": None if metric.verification is None else asdict(metric.verification),
-    }
+    record = {"kind": _FORMAT, **design_record(metric)}
     network = Mlp(
         metric.network.weights,
         metric.network.biases,
@@ -180,16 +175,7 @@ def load_neural_metric(path: Path | str | None = None) -> NeuralMetric:
         record = json.loads(network.metadata["metric"])
         if record["kind"] != _FORMAT:
             raise ValueError(f"kind {record['kind']!r} is not {_FORMAT!r}")
-        check = record["verification"]
-        return NeuralMetric(
-            network=network,
-            contraction_rate=float(record["alpha"]),
-            condition_bound=float(record["chi"]),
-            control_weight=float(record["nu"]),
-            scaling=np.array(record["scaling"], dtype=np.float64),
-            region=Region(**record["region"]),
-            verification=None if check is None else Verification(**check),
-        )
+        return NeuralMetric(network, **design_arguments(record))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{path} is not a metric written by save_neural_metric: {error!r}"

@@ -1,0 +1,110 @@
+"""Semidefinite programs in the form that Clarabel takes: symmetric matrices as vectors, cones.
+
+A symmetric n by n matrix is named by its n(n+1)/2 entries on and above the diagonal, by columns.
+`symmetric_basis` gives the matrix of each entry; `svec` the vector of a matrix whose dot product is
+the trace, sum_ij A_ij B_ij: off-diagonals times sqrt(2) (Boyd and Vandenberghe 2004, section 2.2).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ConeProgram:
+    """min cost'z subject to right - rows z in a product of semidefinite cones, all of size n.
+
+    Attributes:
+        cost: Shape (z,).
+        rows: Shape (cones n(n+1)/2, z).
+        right: Shape (cones n(n+1)/2,).
+        cones: Number of cones.
+        n: Size of the matrix of each.
+        symmetric: `symmetric_basis(n)`, shape (n(n+1)/2, n, n).
+    """
+
+    cost: FloatArray
+    rows: sparse.csc_matrix
+    right: FloatArray
+    cones: int
+    n: int
+    symmetric: FloatArray
+
+
+def symmetric_basis(n: int) -> FloatArray:
+    """Return the symmetric matrices with ones at (i, j) and (j, i), shape (n(n+1)/2, n, n)."""
+    places = [(i, j) for j in range(n) for i in range(j + 1)]
+    matrices = np.zeros((len(places), n, n))
+    for index, (i, j) in enumerate(places):
+        matrices[index, i, j] = matrices[index, j, i] = 1.0
+    return matrices
+
+
+def svec(matrices: FloatArray) -> FloatArray:
+    """Return symmetric matrices (..., n, n) as vectors (..., n(n+1)/2) in the order of the cone."""
+    n = matrices.shape[-1]
+    rows = np.concatenate([np.arange(j + 1) for j in range(n)])
+    columns = np.concatenate([np.full(j + 1, j) for j in range(n)])
+    weight = np.where(rows == columns, 1.0, math.sqrt(2.0))
+    stacked: FloatArray = matrices[..., rows, columns] * weight
+    return stacked
+
+
+def cone_rows(
+    by_dual: FloatArray, by_weight: FloatArray | None, by_condition: FloatArray | None
+) -> FloatArray:
+    """Return the rows of one family of cones: columns for every W_ij, then nu, then chi.
+
+    Args:
+        by_dual: Derivatives of each cone's matrix by the entries of each W_i, shape
+            (cones, degree + 1, n(n+1)/2, n, n).
+        by_weight: Derivatives by nu, shape (cones, n, n); None for zero.
+        by_condition: Derivatives by chi, shape (cones, n, n); None for zero.
+
+    Returns:
+        Rows, shape (cones n(n+1)/2, (degree + 1) n(n+1)/2 + 2).
+    """
+    count = len(by_dual)
+    dual = svec(by_dual)
+    height = dual.shape[-1]
+    dual = np.moveaxis(dual, -1, 1).reshape(count * height, -1)
+    zero = np.zeros((count * height, 1))
+    weight = zero if by_weight is None else svec(by_weight).reshape(-1, 1)
+    condition = zero if by_condition is None else svec(by_condition).reshape(-1, 1)
+    return np.hstack([dual, weight, condition])
+
+
+def solve_cones(program: ConeProgram) -> tuple[FloatArray | None, str]:
+    """Solve a program with Clarabel, in one thread.
+
+    Args:
+        program: The program.
+
+    Returns:
+        z, shape (z,), or None where it was not found, and the solver's status.
+    """
+    import clarabel
+
+    settings: Any = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.max_threads = 1
+    cones = [clarabel.PSDTriangleConeT(program.n)] * program.cones
+    size = program.cost.size
+    quadratic = sparse.csc_matrix((size, size))
+    solver = clarabel.DefaultSolver(
+        quadratic, program.cost, program.rows, program.right, cones, settings
+    )
+    answer = solver.solve()
+    status = str(answer.status)
+    # An almost solved program is accepted only because every metric is verified afterwards.
+    if status not in ("Solved", "AlmostSolved"):
+        return None, status
+    return np.array(answer.x), status
