@@ -1,6 +1,6 @@
 """`lagros attack`: search the bounded disturbance that a policy stands worst.
 
-Only the standard library and typer are imported here; the command imports the rest.
+Only the standard library, typer and `terminal` are imported here; the command imports the rest.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from lagros_benchmarks.terminal import fail
 
 if TYPE_CHECKING:
     from lagros_benchmarks.worst_case.attack import AttackSettings
@@ -75,8 +77,6 @@ def attack(
     ] = None,
 ) -> None:
     """Search the worst bounded disturbance, fly it, and hold the certificate against it."""
-    from lagros_benchmarks.cli import fail
-
     sys.path.insert(0, os.getcwd())
     try:
         if replay is not None:
@@ -181,8 +181,8 @@ def summary(row: dict[str, Any]) -> list[str]:
     ]
     if row.get("max_tracking_error_max") is not None:
         lines.append(
-            f"observed tube {row['max_tracking_error_max']:.3g}; certified (Theorem 1, with the "
-            f"learning error of the flight) {row['certified_radius_max']:.4g}, reached to "
+            f"observed tube {row['max_tracking_error_max']:.3g}; Theorem 1 as the paper states it, "
+            f"with the learning error of the flight, {row['certified_radius_max']:.4g}, reached to "
             f"{100 * row['certified_share_max']:.2g} %, "
             + ("CROSSED" if row["certified_crossed_rate"] else "never crossed")
         )

@@ -1,6 +1,6 @@
 """`lagros certify`: what is proved, calibrated and observed of a task, in one certificate.
 
-Only the standard library and typer are imported here; the command imports the rest.
+Only the standard library, typer and `terminal` are imported here; the command imports the rest.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from lagros_benchmarks.terminal import fail
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -53,7 +55,6 @@ def certify(
 
     Ends with status 1 if anything that it claims does not hold.
     """
-    from lagros_benchmarks.cli import fail
     from lagros_benchmarks.settings import check_task
     from lagros_envs.files import write_atomic
 

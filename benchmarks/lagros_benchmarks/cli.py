@@ -1,6 +1,6 @@
 """The command line `lagros`.
 
-Only the standard library, typer and `settings` are imported here; what a command needs is imported
+Only the standard library, typer and `terminal` are imported here; what a command needs is imported
 inside it, so that `lagros --help` answers at once.
 """
 
@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,6 +17,13 @@ from lagros_benchmarks.attack import attack
 from lagros_benchmarks.certify import certify
 from lagros_benchmarks.data import data
 from lagros_benchmarks.export import export
+from lagros_benchmarks.terminal import (
+    fail,
+    listed,
+    listed_or_none,
+    progress_bar,
+    progress_line,
+)
 from lagros_benchmarks.train import train
 from lagros_benchmarks.watch import watch
 
@@ -26,11 +31,9 @@ if TYPE_CHECKING:
     from lagros_benchmarks.records import Row
     from lagros_benchmarks.report import Outputs
     from lagros_benchmarks.reproduction import Reproduction
-    from lagros_benchmarks.runner import Progress
     from lagros_benchmarks.settings import BenchmarkSettings
     from lagros_policies.backends import Backend
 
-USAGE_ERROR = 2
 DEMO_FOLDER = Path("runs/demo")
 # The paper's experiment: the default policies, 50 episodes, uniform disturbance.
 DEMO: dict[str, Any] = {"episodes": 50, "disturbances": ("uniform",), "bounds": (0.75,)}
@@ -42,8 +45,6 @@ app = typer.Typer(
     pretty_exceptions_show_locals=False,
 )
 
-Value = TypeVar("Value")
-
 
 def _file(explanation: str) -> Any:
     return typer.Option(metavar="FILE", dir_okay=False, help=explanation)
@@ -53,34 +54,6 @@ BACKEND_OPTION = typer.Option(help="Whose processes the workers are: of loky, ra
 ADDRESS_OPTION = typer.Option(
     help="Of a running cluster of ray or dask, which is used with the workers that it has."
 )
-
-
-def fail(error: Exception | str, status: int = USAGE_ERROR) -> NoReturn:
-    """Say what is wrong, without a traceback, and end with the exit status."""
-    typer.echo(f"lagros: {error}", err=True)
-    raise typer.Exit(status)
-
-
-def listed(text: str, convert: Callable[[str], Value], option: str) -> tuple[Value, ...]:
-    """Split a comma-separated option.
-
-    Raises:
-        ValueError: An entry cannot be converted.
-    """
-    values = []
-    for entry in filter(None, (part.strip() for part in text.split(","))):
-        try:
-            values.append(convert(entry))
-        except ValueError:
-            kind = "a whole number" if convert is int else "a number"
-            raise ValueError(f"{option}: {entry!r} is not {kind}") from None
-    return tuple(values)
-
-
-def _listed_or_none(
-    text: str | None, convert: Callable[[str], Value], option: str
-) -> tuple[Value, ...] | None:
-    return None if text is None else listed(text, convert, option)
 
 
 @app.callback(invoke_without_command=True)
@@ -183,16 +156,16 @@ def bench(
             raise ValueError(f"--replan-every is for cartpole; leave it out for {task}")
         settings = BenchmarkSettings.for_task(
             task,
-            policies=_listed_or_none(policies, str, "--policies"),
+            policies=listed_or_none(policies, str, "--policies"),
             policy_settings=None
             if replan_every is None
             else {"tube-mpc": {"replan_every": replan_every}},
             episodes=episodes,
             seed=seed,
             disturbances=listed(disturbance, str, "--disturbance"),
-            bounds=_listed_or_none(bound, float, "--bound"),
+            bounds=listed_or_none(bound, float, "--bound"),
             channels=channels,
-            agents=_listed_or_none(agents, int, "--agents"),
+            agents=listed_or_none(agents, int, "--agents"),
             preset=preset,
             safety_filter=safety_filter,
             jobs=jobs,
@@ -292,11 +265,6 @@ app.command()(attack)
 app.add_typer(data, name="data")
 
 
-def progress_line(line: str) -> None:
-    """Print a line above the progress bar."""
-    typer.echo(line, err=True)
-
-
 def run_and_report(settings: BenchmarkSettings, outputs: Outputs) -> list[Row]:
     """Run a benchmark with a progress bar, print its table and write its files.
 
@@ -324,28 +292,3 @@ def run_and_report(settings: BenchmarkSettings, outputs: Outputs) -> list[Row]:
     for path in outputs.write(run, rows):
         typer.echo(f"wrote {path}")
     return rows
-
-
-@contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """Give a function that draws progress on the terminal's error stream."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    with Bar(
-        TextColumn("{task.description:<9}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        transient=True,
-    ) as bar:
-        tasks: dict[str, Any] = {}
-
-        def update(title: str, done: int, total: int) -> None:
-            if title not in tasks:
-                tasks[title] = bar.add_task(title, total=total)
-            bar.update(tasks[title], completed=done)
-
-        yield update

@@ -1,6 +1,6 @@
 """`lagros data`: what the expert did, in the formats of other libraries.
 
-Only the standard library and typer are imported here; the commands import the rest.
+Only the standard library, typer and `terminal` are imported here; the commands import the rest.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from lagros_benchmarks.terminal import fail, progress_bar
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -62,8 +64,6 @@ def export(
     ] = Path("runs/minari"),
 ) -> None:
     """Fly the expert and write its episodes, with the record of metric and planner."""
-    from lagros_benchmarks.cli import fail, progress_bar
-
     if not minari:
         fail("name the format to write: pass --minari")
     missing = missing_packages()

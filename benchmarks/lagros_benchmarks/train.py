@@ -1,6 +1,6 @@
 """`lagros train`: reinforcement learning of our tasks with stable-baselines3.
 
-Only the standard library and typer are imported here; the command imports the rest.
+Only the standard library, typer and `terminal` are imported here; the command imports the rest.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from lagros_benchmarks.terminal import fail, listed
 
 if TYPE_CHECKING:
     from lagros_benchmarks.training.settings import Training
@@ -65,7 +67,6 @@ def train(
     ] = None,
 ) -> None:
     """Train agents, one after the other; go on where a run was killed, skip what is complete."""
-    from lagros_benchmarks.cli import fail, listed
     from lagros_benchmarks.training.settings import default_training
 
     try:

@@ -1,6 +1,6 @@
 """`lagros watch`: one episode as it moves, in a window or as a video.
 
-Only the standard library and typer are imported here; the command imports the rest.
+Only the standard library, typer and `terminal` are imported here; the command imports the rest.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from lagros_benchmarks.terminal import fail
 
 
 def watch(
@@ -64,7 +66,6 @@ def watch(
     ] = None,
 ) -> None:
     """Watch one episode: agents, thrusters, sensing, tubes, goals, collisions."""
-    from lagros_benchmarks.cli import fail
     from lagros_benchmarks.playback import Playback, WatchSettings
 
     # A policy of the user's own, module:Class, lies in the folder that lagros is run from.

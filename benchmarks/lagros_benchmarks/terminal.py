@@ -1,0 +1,78 @@
+"""What the commands say on the terminal: errors without a traceback, lists, progress.
+
+Only the standard library and typer are imported here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+
+import typer
+
+if TYPE_CHECKING:
+    from lagros_benchmarks.workers import Progress
+
+USAGE_ERROR = 2
+
+Value = TypeVar("Value")
+
+
+def fail(error: Exception | str, status: int = USAGE_ERROR) -> NoReturn:
+    """Say what is wrong, without a traceback, and end with the exit status."""
+    typer.echo(f"lagros: {error}", err=True)
+    raise typer.Exit(status)
+
+
+def listed(text: str, convert: Callable[[str], Value], option: str) -> tuple[Value, ...]:
+    """Split a comma-separated option.
+
+    Raises:
+        ValueError: An entry cannot be converted.
+    """
+    values = []
+    for entry in filter(None, (part.strip() for part in text.split(","))):
+        try:
+            values.append(convert(entry))
+        except ValueError:
+            kind = "a whole number" if convert is int else "a number"
+            raise ValueError(f"{option}: {entry!r} is not {kind}") from None
+    return tuple(values)
+
+
+def listed_or_none(
+    text: str | None, convert: Callable[[str], Value], option: str
+) -> tuple[Value, ...] | None:
+    """Split a comma-separated option that may be left out; see `listed`."""
+    return None if text is None else listed(text, convert, option)
+
+
+def progress_line(line: str) -> None:
+    """Print a line above the progress bar."""
+    typer.echo(line, err=True)
+
+
+@contextmanager
+def progress_bar() -> Iterator[Progress]:
+    """Give a function that draws progress on the terminal's error stream."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    with Bar(
+        TextColumn("{task.description:<9}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    ) as bar:
+        tasks: dict[str, Any] = {}
+
+        def update(title: str, done: int, total: int) -> None:
+            if title not in tasks:
+                tasks[title] = bar.add_task(title, total=total)
+            bar.update(tasks[title], completed=done)
+
+        yield update
