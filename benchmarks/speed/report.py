@@ -184,7 +184,10 @@ def print_targets(console: Console, sections: Sequence[Section]) -> None:
     table = Table(title="Targets", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in ("", "measured", "target", ""):
         table.add_column(heading, justify="left" if heading == "" else "right")
-    for target in (target for section in sections for target in section.targets):
+    targets = [target for section in sections for target in section.targets]
+    if not targets:
+        return
+    for target in targets:
         sign = "≥" if target.at_least else "≤"
         table.add_row(
             target.what,

@@ -20,7 +20,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE.parent / "results" / "speed.json"
 RATIOS = HERE.parent / "results" / "speed_ratios.json"
-TOPICS = ("planner", "sdp", "network", "environment", "ratios")
+TOPICS = ("planner", "sdp", "network", "hold", "environment", "ratios")
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 
 

@@ -44,7 +44,7 @@ _PI_PARTS = (3.1415926218032837, 3.1786509424591713e-08, 1.2246467991473532e-16)
 _SINE_POWERS = range(3, 18, 2)
 _COSINE_POWERS = range(2, 17, 2)
 # Columns that go through all repeats before the next do, so that they stay in the first cache.
-_BLOCK = 128
+BLOCK = 128
 # Before a loop the compiler makes sure that rows do not overlap, each that is written against all
 # others. Beyond so many pairs it gives up, and the loop is not vectorised.
 _MOST_PAIRS = 128
@@ -107,7 +107,7 @@ class CompiledBatch:
         inputs = len(step.inputs) + given
         size = math.prod(shape)
         # Whole blocks: the last columns may be nobody's.
-        columns = size + -size % _BLOCK
+        columns = size + -size % BLOCK
         self._flat = np.zeros((inputs + (len(tail.outputs) if tail else 0), columns))
         rows = self._flat[:, :size].reshape(-1, *shape)
         self.inputs, self.states, self.measured = rows[:inputs], rows[:n], rows[inputs:]
@@ -154,13 +154,19 @@ def compiled_function(source: str, fuse: bool = False) -> Any:
     return decorate(module.held)
 
 
-def batch_source(step: StraightLine, repeats: int, tail: StraightLine | None = None) -> str:
+def batch_source(
+    step: StraightLine,
+    repeats: int,
+    tail: StraightLine | None = None,
+    abreast: int | None = None,
+) -> str:
     """Return a module in Python whose function `held` repeats a step on the columns of an array.
 
     Args:
         step: What is repeated; its outputs go to its first inputs.
         repeats: How often.
         tail: What is computed at the end, from inputs of the step and from others.
+        abreast: Columns that advance side by side; None for as many as the compiler takes.
 
     Returns:
         Source of `held(rows)`, where `rows` has shape (inputs + outputs of the tail, batch), in
@@ -176,18 +182,18 @@ def batch_source(step: StraightLine, repeats: int, tail: StraightLine | None = N
         ending = [f"{name} = row{names.index(name)}[i]" for name in tail.inputs] + lines
         ending += [f"row{len(names) + k}[i] = {output}" for k, output in enumerate(measured)]
         count = len(names) + len(measured)
-    abreast = _abreast(len(step.inputs), len(step.outputs))
+    abreast = abreast or _abreast(len(step.inputs), len(step.outputs))
     return "\n".join(
         [
             IMPORTS,
             "",
             "def held(rows):",
-            f"    for start in range(0, rows.shape[1], {_BLOCK}):",
-            *(f"        row{k} = rows[{k}][start:start + {_BLOCK}]" for k in range(count)),
+            f"    for start in range(0, rows.shape[1], {BLOCK}):",
+            *(f"        row{k} = rows[{k}][start:start + {BLOCK}]" for k in range(count)),
             f"        for _ in range({repeats}):",
-            f"            for i in range({_BLOCK // abreast}):",
+            f"            for i in range({BLOCK // abreast}):",
             *(f"                {line}" for line in _side_by_side(step, abreast)),
-            f"        for i in range({_BLOCK}):",
+            f"        for i in range({BLOCK}):",
             *(f"            {line}" for line in ending),
             "",
         ]
@@ -206,7 +212,7 @@ def _abreast(inputs: int, outputs: int) -> int:
 
 def _side_by_side(step: StraightLine, abreast: int) -> list[str]:
     """Return the lines of a step on that many entries of each row, by turns."""
-    places = {f"_{k}": f"i + {k * _BLOCK // abreast}" for k in range(abreast)}
+    places = {f"_{k}": f"i + {k * BLOCK // abreast}" for k in range(abreast)}
     results = {name: f"v{place}" for place, name in enumerate(step.operations)}
     results |= {name: name for name in step.inputs}
 

@@ -6,7 +6,7 @@ import json
 import pytest
 from rich.cells import cell_len
 from rich.console import Console
-from speed import environment, network, planner, report, sdp, timing
+from speed import environment, hold, network, planner, report, sdp, timing
 
 TINY = timing.Scale(
     steps=20,
@@ -24,9 +24,9 @@ TINY = timing.Scale(
 # Peers warn about their own affairs (torch.jit is deprecated).
 @pytest.mark.filterwarnings("ignore")
 def test_every_topic_gives_rows_and_a_file(tmp_path):
-    topics = (planner, sdp, network, environment)
+    topics = (planner, sdp, network, hold, environment)
     sections = [section for topic in topics for section in topic.sections(TINY)]
-    assert len(sections) == 13
+    assert len(sections) == 14
     assert all(section.rows for section in sections)
     shown = io.StringIO()
     console = Console(file=shown, width=report.WIDTH)
