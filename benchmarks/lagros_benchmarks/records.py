@@ -34,7 +34,11 @@ def summarise(run: BenchmarkRun, command: Sequence[str] | None = None) -> list[R
     surroundings = {
         "machine": machine(),
         "versions": versions(),
-        "threads": {**threads(), "jobs": run.settings.jobs},
+        "threads": {
+            **threads(),
+            "jobs": run.settings.jobs,
+            "backend": run.settings.backend.name,
+        },
         "command": shlex.join(command if command is not None else own_command()),
     }
     if isinstance(run, CartPoleRun):

@@ -1,0 +1,83 @@
+"""What every backend shares: its name and address, its errors, what is said of lost chunks."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+Item = TypeVar("Item")
+Outcome = TypeVar("Outcome")
+
+BACKENDS = ("loky", "ray", "dask")
+# How often a chunk may lose its worker: what kills so many (too little memory, say) will go on.
+ATTEMPTS = 4
+
+_LOG = logging.getLogger(__name__)
+
+
+class BackendError(RuntimeError):
+    """A backend is not installed, not reachable, or loses its workers again and again."""
+
+
+@dataclass(frozen=True)
+class Backend:
+    """What runs chunks of work.
+
+    Attributes:
+        name: "loky" (processes of this machine, by joblib), "ray" or "dask".
+        address: Of a running cluster, as Ray ("auto", "ray://host:10001") or Dask
+            ("tcp://host:8786") writes it; None starts workers on this machine.
+
+    Raises:
+        ValueError: The name is unknown, or loky has an address.
+    """
+
+    name: str = "loky"
+    address: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.name not in BACKENDS:
+            raise ValueError(f"unknown backend {self.name!r}. Valid: {', '.join(BACKENDS)}.")
+        if self.name == "loky" and self.address is not None:
+            raise ValueError(
+                f"address={self.address!r} is for a cluster of ray or dask; leave it out for loky, "
+                "whose workers run on this machine"
+            )
+
+    def in_parallel(self, jobs: int) -> bool:
+        """Return whether chunks run in other processes than this one."""
+        return jobs > 1 or self.name != "loky"
+
+
+LOKY = Backend()
+
+
+def say_lost(chunks: int) -> None:
+    """Log that so many chunks lost their worker and are run again."""
+    _LOG.warning("a worker died: %d chunk(s) of work are run again", chunks)
+
+
+def gave_up(deaths: int, error: Exception) -> BackendError:
+    """Return the error that ends a run whose chunk lost so many workers."""
+    return BackendError(
+        f"a chunk of work lost its worker {deaths} times ({type(error).__name__}); most often the "
+        "memory is too small: take fewer jobs"
+    )
+
+
+def installed(module: str) -> Any:
+    """Import what a backend needs.
+
+    Raises:
+        BackendError: It is not installed.
+    """
+    extra = "dask" if module == "distributed" else module
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise BackendError(
+            f"the backend {extra} is not installed; pip install 'lagros[{extra}]'"
+        ) from error

@@ -1,0 +1,131 @@
+"""Chunks of work as tasks of Ray.
+
+A result lies outside the process that made it as soon as the task is done, so that a worker process
+that dies takes nothing with it but what it was running. A whole machine of the cluster that goes
+takes more: what its processes were running, and those of their results over 100 KiB that nobody had
+fetched yet.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from lagros_policies.backends.base import (
+    ATTEMPTS,
+    BackendError,
+    Item,
+    Outcome,
+    gave_up,
+    installed,
+)
+
+
+def run(
+    ray: Any,
+    work: Callable[[Item], Outcome],
+    items: Sequence[Item],
+    on_lost: Callable[[int], None],
+) -> Iterator[tuple[int, Outcome]]:
+    """Yield index and result of every item, as `backends.each` does.
+
+    Args:
+        ray: The module, connected.
+        work: Called with each item.
+        items: The items.
+        on_lost: Told how many chunks lost their worker.
+
+    Raises:
+        BackendError: A chunk lost too many workers.
+    """
+    errors = ray.exceptions
+    losses = (
+        errors.WorkerCrashedError,
+        errors.NodeDiedError,
+        errors.ObjectLostError,
+        errors.OutOfMemoryError,
+    )
+    # We run again what is lost: Ray would do it in silence.
+    remote = ray.remote(max_retries=0)(_call)
+    shared = ray.put(work)
+    begun = {remote.remote(shared, item): (index, 1) for index, item in enumerate(items)}
+    try:
+        while begun:
+            (reference,), _ = ray.wait(list(begun), num_returns=1)
+            index, attempt = begun.pop(reference)
+            try:
+                outcome = ray.get(reference)
+            except losses as error:
+                if attempt == ATTEMPTS:
+                    raise gave_up(attempt, error) from error
+                begun[remote.remote(shared, items[index])] = index, attempt + 1
+                on_lost(1)
+                continue
+            except errors.RayTaskError as error:
+                raise error.cause from error
+            yield index, outcome
+    finally:
+        for reference in begun:
+            ray.cancel(reference, force=True)
+
+
+def _call(work: Callable[[Item], Outcome], item: Item) -> Outcome:
+    return work(item)
+
+
+@contextmanager
+def connected(address: str | None, jobs: int) -> Iterator[Any]:
+    """Connect to a cluster, or start Ray on this machine, and yield the module.
+
+    Args:
+        address: Of the cluster; None starts Ray here.
+        jobs: Worker processes, where it is started here.
+
+    Raises:
+        BackendError: Ray is not installed, does not answer or does not start.
+    """
+    # Nobody asked for Ray's telemetry.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    ray = installed("ray")
+    if ray.is_initialized():
+        yield ray
+        return
+    quiet = {"log_to_driver": False, "logging_level": logging.CRITICAL}
+    try:
+        if address is None:
+            _start(ray, num_cpus=jobs, **quiet)
+        else:
+            _knock(address)
+            ray.init(address=address, **quiet)
+    except (OSError, ValueError) as error:
+        raise BackendError(f"no Ray cluster answers at {address!r}: {error}") from error
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+def _start(ray: Any, **settings: Any) -> None:
+    """Start Ray on this machine, again if need be: it gives its own processes 15 s to start."""
+    for attempt in range(1, ATTEMPTS + 1):
+        try:
+            ray.init(address="local", include_dashboard=False, **settings)
+            return
+        except Exception as error:  # Ray raises no other class here
+            ray.shutdown()
+            if attempt == ATTEMPTS:
+                raise BackendError(
+                    f"Ray does not start ({error}); where the machine is busy, start it by hand "
+                    "with `ray start --head` and name it with --address auto"
+                ) from error
+
+
+def _knock(address: str) -> None:
+    """Raise OSError at once where nothing listens: Ray itself goes on asking for minutes."""
+    host, colon, port = address.rpartition("//")[2].rpartition(":")
+    if colon:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=10.0).close()
