@@ -1,6 +1,6 @@
-"""`lagros export`: a cart-pole policy as an ONNX model or one C99 file.
+"""`lagros export`: a policy as an ONNX model or one C99 file.
 
-Only the standard library and typer are imported here; the command imports the rest.
+Only the standard library, typer and `terminal` are imported here; the command imports the rest.
 """
 
 from __future__ import annotations
@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from lagros_benchmarks.terminal import fail
+
 if TYPE_CHECKING:
     from lagros_policies.export.c99 import Tanh
     from lagros_policies.export.check import Agreement
-    from lagros_policies.export.source import NetworkSource
+    from lagros_policies.export.source import Source
 
 FORMATS = ("c", "onnx")
 # Largest difference from NumPy, in units of the largest force, with which a file is written: room
@@ -22,7 +24,12 @@ TOLERANCE = 1e-5
 
 
 def export(
-    policy: Annotated[str, typer.Argument(help="lagros-cartpole or learned-cartpole.")],
+    policy: Annotated[
+        str,
+        typer.Argument(
+            help="lagros-cartpole, learned-cartpole, lagros-spacecraft or learned-spacecraft."
+        ),
+    ],
     format_: Annotated[
         str,
         typer.Option("--format", metavar="FORMAT", help="c (one C99 file) or onnx."),
@@ -40,31 +47,43 @@ def export(
         ),
     ] = None,
     tanh: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="KIND",
-            help="In C: libm, or rational (a quotient of polynomials, 4e-7 off, much faster).",
+            help="In C, of the cart-pole: rational (a quotient of polynomials, 4e-7 off) or libm "
+            "(much slower); rational if not given.",
         ),
-    ] = "libm",
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help="Of the spacecraft: the radii of its bodies; paper if not given."),
+    ] = None,
+    agents: Annotated[
+        int | None,
+        typer.Option(help="Of the spacecraft: slots of the observation in ONNX; as the preset."),
+    ] = None,
 ) -> None:
-    """Write u_L(x, o, t) as a file without Python: features, mirror and network, in newtons."""
-    from lagros_benchmarks.cli import fail
+    """Write u_L(x, o_l, t) as a file without Python, from an observation to newtons."""
     from lagros_envs.files import write_atomic
     from lagros_policies.export.c99 import TANHS
-    from lagros_policies.export.source import load_source
+    from lagros_policies.export.source import CARTPOLE_NAMES, SPACECRAFT_NAMES, load_source
 
     if format_ not in FORMATS:
         fail(f"--format: {format_!r} must be one of {', '.join(FORMATS)}")
-    if tanh not in TANHS:
+    if tanh is not None and tanh not in TANHS:
         fail(f"--tanh: {tanh!r} must be one of {', '.join(TANHS)}")
-    if format_ == "onnx" and tanh != "libm":
+    if format_ == "onnx" and tanh is not None:
         fail("--tanh is for --format c; leave it out for onnx")
+    if policy in CARTPOLE_NAMES and (preset is not None or agents is not None):
+        fail("--preset and --agents are for the spacecraft; leave them out for the cart-pole")
+    if policy in SPACECRAFT_NAMES and tanh is not None:
+        fail("--tanh is for the cart-pole; the spacecraft's network has no tanh: leave it out")
     try:
-        source = load_source(policy, weights)
+        source = load_source(policy, weights, preset or "paper", agents)
     except (ValueError, OSError) as error:
         fail(error)
     try:
-        data, found = _written(source, format_, cast("Tanh", tanh))
+        data, found = _written(source, format_, cast("Tanh", tanh or TANHS[0]))
     except RuntimeError as error:
         fail(error, status=1)
     if isinstance(found, str):
@@ -84,20 +103,17 @@ def export(
     typer.echo(f"wrote {path} ({path.stat().st_size / 1e3:.0f} kB)")
 
 
-def _written(
-    source: NetworkSource, format_: str, tanh: Tanh
-) -> tuple[str | bytes, Agreement | str]:
+def _written(source: Source, format_: str, tanh: Tanh) -> tuple[str | bytes, Agreement | str]:
     """Return the file's content and how it compares with NumPy, or why it was not compared."""
     from lagros_policies.export import check
-    from lagros_policies.export.c99 import c_source
-    from lagros_policies.export.onnx import policy_model
+    from lagros_policies.export.file import c_file, onnx_file
 
     if format_ == "c":
-        text = c_source(source, tanh)
+        text = c_file(source, tanh)
         if check.compiler() is None:
             return text, "no C compiler (gcc, cc) is on the path"
         return text, check.check_c(text, source)
-    model = policy_model(source)
+    model = onnx_file(source)
     if not check.has_onnxruntime():
-        return model, "ONNX Runtime is not installed (pip install onnxruntime)"
+        return model, f"ONNX Runtime is not installed ({check.INSTALL})"
     return model, check.check_onnx(model, source)

@@ -1,9 +1,9 @@
 """Policies as files for other machines: an ONNX model or one C99 file.
 
-Both map what the cart-pole policies (a) and (c) see to the force in newtons, features and mirror
-included.
+Both map what a policy (a) or (c) observes of the cart-pole or the spacecraft to forces in newtons,
+features included.
 """
 
-from lagros_policies.export.source import NAMES, NetworkSource, load_source
+from lagros_policies.export.source import NAMES, NetworkSource, SpacecraftSource, load_source
 
-__all__ = ["NAMES", "NetworkSource", "load_source"]
+__all__ = ["NAMES", "NetworkSource", "SpacecraftSource", "load_source"]

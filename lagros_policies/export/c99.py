@@ -1,9 +1,4 @@
-"""A cart-pole policy as one C99 file: weights, features, mirror, no dependency but `tanhf`.
-
-A layer adds the rows of its matrix, each times one input, into as many sums as it has outputs:
-the order of memory, and a loop that compilers turn into vector instructions without being allowed
-to change the result.
-"""
+"""A cart-pole policy as one C99 file: weights, features, mirror, no dependency but `tanhf`."""
 
 from __future__ import annotations
 
@@ -12,26 +7,28 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_policies.export.c_layers import (
+    TANH_ERROR,
+    TANH_LIMIT,
+    TANH_P,
+    TANH_Q,
+    Activation,
+    array,
+    layer,
+    rational_tanh_source,
+)
 from lagros_policies.export.source import NetworkSource, example_observations
 
+__all__ = ["TANHS", "TANH_ERROR", "TANH_LIMIT", "TANH_P", "TANH_Q", "Tanh", "c_source"]
+
 Float32Array = NDArray[np.float32]
-Tanh = Literal["libm", "rational"]
+Tanh = Literal["rational", "libm"]
 TANHS: tuple[str, ...] = get_args(Tanh)
 
-# tanh(x) = x P(x^2) / Q(x^2) for |x| <= 9, where tanh(9) is 1 to half a unit of float32; constant
-# beyond. Fitted by benchmarks/tuning/rational_tanh.py for the least largest relative error.
-TANH_LIMIT = 9.0
-TANH_P = (1.0, 0.13381027, 0.0034955884, 2.0609088e-05, 1.3354667e-08)
-TANH_Q = (1.0, 0.46714342, 0.025876984, 0.00032856353, 7.7765606e-07)
-# Relative; observed (3.81e-7) on every second float32 from 2^-20 to 16.
-TANH_ERROR = 4e-7
-
 _SAMPLES = 8  # of the self-test
-# Sums of a single output, kept apart so that they can be formed side by side.
-_LANES = (20, 16, 8, 4, 2, 1)
 
 
-def c_source(source: NetworkSource, tanh: Tanh = "libm") -> str:
+def c_source(source: NetworkSource, tanh: Tanh = "rational") -> str:
     """Return the C99 file of a policy.
 
     It defines `float NAME_force(state, goal, initial_state, time)` and
@@ -41,8 +38,8 @@ def c_source(source: NetworkSource, tanh: Tanh = "libm") -> str:
 
     Args:
         source: The policy.
-        tanh: "libm" calls `tanhf`; "rational" is a quotient of two polynomials, several times
-            faster, within `TANH_ERROR` of tanh, relative.
+        tanh: "rational" is a quotient of two polynomials, within `TANH_ERROR` of tanh, relative;
+            "libm" calls `tanhf`, several times slower and no closer to NumPy.
 
     Raises:
         ValueError: `tanh` is unknown.
@@ -52,9 +49,7 @@ def c_source(source: NetworkSource, tanh: Tanh = "libm") -> str:
     name = source.name.replace("-", "_")
     parts = [
         _header(source, name, tanh),
-        _tanh(tanh) if len(_widths(source)) > 2 else "",
-        *_weights(source),
-        _network(source),
+        _network(source, tanh),
         _interface(name),
         _self_test(source, name),
     ]
@@ -94,82 +89,29 @@ float {name}_observation(const float observation[13]);
 """
 
 
-def _tanh(tanh: Tanh) -> str:
-    if tanh == "libm":
-        return "#include <math.h>\n#define LAGROS_TANH tanhf\n"
-    limit = _literal(TANH_LIMIT)
-    return f"""static float rational_tanh(float value)
-{{
-    const float below = value > {limit} ? {limit} : value;
-    const float x = below < -{limit} ? -{limit} : below;
-    const float s = x * x;
-    return x * ({_horner(TANH_P)}) / ({_horner(TANH_Q)});
-}}
-#define LAGROS_TANH rational_tanh
-"""
-
-
-def _horner(coefficients: tuple[float, ...]) -> str:
-    text = _literal(coefficients[-1])
-    for value in coefficients[-2::-1]:
-        text = f"{_literal(value)} + s * ({text})"
-    return text
-
-
-def _weights(source: NetworkSource) -> list[str]:
+def _network(source: NetworkSource, tanh: Tanh) -> str:
     network = source.network
-    parts = []
+    last = len(network.weights) - 1
+    names = ["features", *(f"hidden{index}" for index in range(last)), "force"]
+    layers, memory, calls = [], [], []
     for index, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
-        parts.append(_array(f"weight{index}", weight))
-        parts.append(_array(f"bias{index}", bias))
-    return parts
-
-
-def _network(source: NetworkSource) -> str:
-    widths = _widths(source)
-    layers = [_layer(index, *widths[index : index + 2]) for index in range(len(widths) - 2)]
-    last = len(layers)
-    calls = [f"    layer{index}(layer_{index}, layer_{index + 1});" for index in range(last)]
-    memory = [f"    float layer_{index + 1}[{widths[index + 1]}];" for index in range(last)]
-    lanes = next(count for count in _LANES if widths[-2] % count == 0)
+        activation: Activation = "none" if index == last else tanh
+        layers.append(layer(f"layer{index}", weight, bias, activation))
+        calls.append(f"    layer{index}({names[index]}, {names[index + 1]});")
+        memory.append(f"    float {names[index + 1]}[{len(bias)}];")
+    head = "#include <math.h>\n" if tanh == "libm" else rational_tanh_source()
     lines = [
+        *([head] if last else []),
         *layers,
-        "static float network(const float *layer_0)",
+        "static float network(const float *features)",
         "{",
         *memory,
-        f"    float sums[{lanes}] = {{0.0f}};",
-        f"    float sum = bias{last}[0];",
-        "    int i, j;",
         *calls,
-        f"    for (i = 0; i < {widths[-2]}; i += {lanes})",
-        f"        for (j = 0; j < {lanes}; j++)",
-        f"            sums[j] += layer_{last}[i + j] * weight{last}[i + j];",
-        f"    for (j = 0; j < {lanes}; j++)",
-        "        sum += sums[j];",
-        "    return sum;",
+        "    return force[0];",
         "}",
         "",
     ]
     return "\n".join(lines)
-
-
-def _layer(index: int, inputs: int, outputs: int) -> str:
-    return f"""static void layer{index}(const float *restrict input, float *restrict output)
-{{
-    const float *restrict row = weight{index};
-    float sum[{outputs}];
-    int i, j;
-    for (j = 0; j < {outputs}; j++)
-        sum[j] = bias{index}[j];
-    for (i = 0; i < {inputs}; i++, row += {outputs}) {{
-        const float value = input[i];
-        for (j = 0; j < {outputs}; j++)
-            sum[j] += value * row[j];
-    }}
-    for (j = 0; j < {outputs}; j++)
-        output[j] = LAGROS_TANH(sum[j]);
-}}
-"""
 
 
 def _interface(name: str) -> str:
@@ -203,8 +145,8 @@ def _self_test(source: NetworkSource, name: str) -> str:
 #include <stdio.h>
 
 /* Forces by NumPy in float32; another order of summation moves them in the last digits. */
-{_array("test_observations", observations)}
-{_array("test_forces", forces)}
+{array("test_observations", observations)}
+{array("test_forces", forces)}
 int main(void)
 {{
     int i, failures = 0;
@@ -229,16 +171,3 @@ int main(void)
 def _widths(source: NetworkSource) -> list[int]:
     network = source.network
     return [network.inputs, *(len(bias) for bias in network.biases)]
-
-
-def _array(name: str, values: Float32Array) -> str:
-    """Return the definition of an array, its numbers in rows of six."""
-    texts = [_literal(float(value)) for value in values.ravel()]
-    rows = (", ".join(texts[begin : begin + 6]) for begin in range(0, len(texts), 6))
-    return f"static const float {name}[{len(texts)}] = {{\n    " + ",\n    ".join(rows) + "};\n"
-
-
-def _literal(value: float) -> str:
-    """Return a float32 as a C99 hexadecimal constant, which every compiler reads exactly."""
-    mantissa, exponent = float(np.float32(value)).hex().split("p")
-    return f"{mantissa.rstrip('0').removesuffix('.')}p{exponent}f"

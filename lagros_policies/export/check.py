@@ -8,7 +8,7 @@ import importlib.util
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -16,19 +16,20 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_policies.export.source import NetworkSource, example_observations
+from lagros_policies.export.source import Source, SpacecraftSource
 
 Float32Array = NDArray[np.float32]
 
+INSTALL = 'pip install "lagros[onnx]"'
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 # Called with many observations, so that the time of a call from Python does not count.
 _MANY = """
-void many(const float *observations, int count, float *forces);
-void many(const float *observations, int count, float *forces)
+void many(const float *observations, int count, float *answers);
+void many(const float *observations, int count, float *answers)
 {{
     int i;
     for (i = 0; i < count; i++)
-        forces[i] = {function}_observation(observations + 13 * i);
+        {call};
 }}
 """
 
@@ -47,7 +48,7 @@ class CompiledPolicy:
     """The C file of a policy as a function, compiled into a temporary folder.
 
     Args:
-        text: The file, from `c_source`.
+        text: The file, from `c_source` or `spacecraft_source`.
         source: The policy that it was made of.
         flags: Flags of the compiler, beside those for a shared library.
 
@@ -58,9 +59,7 @@ class CompiledPolicy:
     Use as a context manager, or `close` it.
     """
 
-    def __init__(
-        self, text: str, source: NetworkSource, flags: Sequence[str] = (*STRICT, "-O2")
-    ) -> None:
+    def __init__(self, text: str, source: Source, flags: Sequence[str] = (*STRICT, "-O2")) -> None:
         """Compile and load."""
         tool = compiler()
         if tool is None:
@@ -68,12 +67,13 @@ class CompiledPolicy:
         self._folder = tempfile.TemporaryDirectory(prefix="lagros-export-")
         folder = Path(self._folder.name)
         code, library = folder / "policy.c", folder / "policy.so"
-        code.write_text(text + _MANY.format(function=source.name.replace("-", "_")))
+        code.write_text(text + _MANY.format(call=_call(source)))
         command = [tool, *flags, "-shared", "-fPIC", str(code), "-o", str(library), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             self.close()
             raise RuntimeError(f"{tool} refuses the exported file:\n{done.stderr}")
+        self._inputs, self._outputs = source.inputs, source.outputs
         self._many = ctypes.CDLL(str(library)).many
         self._many.restype = None
         self._many.argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p]
@@ -93,18 +93,32 @@ class CompiledPolicy:
         """Remove the temporary folder; the loaded function stays usable."""
         self._folder.cleanup()
 
-    def force(self, observation: Float32Array) -> Float32Array:
-        """Return the force [N], shape (B,), of observations (B, 13), one C call each."""
+    def answer(self, observation: Float32Array) -> Float32Array:
+        """Return the forces [N], shape (B, outputs), of observations (B, o), one C call each."""
         rows = np.ascontiguousarray(observation, np.float32)
-        if rows.ndim != 2 or rows.shape[1] != 13:
-            raise ValueError(f"observation has shape {rows.shape}; it must be (B, 13)")
-        forces = np.empty(len(rows), np.float32)
-        self._many(rows.ctypes.data, len(rows), forces.ctypes.data)
-        return forces
+        if rows.ndim != 2 or rows.shape[1] != self._inputs:
+            raise ValueError(f"observation has shape {rows.shape}; it must be (B, {self._inputs})")
+        answers = np.empty((len(rows), self._outputs), np.float32)
+        self._many(rows.ctypes.data, len(rows), answers.ctypes.data)
+        return answers
+
+    def force(self, observation: Float32Array) -> Float32Array:
+        """Return the force [N] of the cart-pole, shape (B,), of observations (B, 13)."""
+        return self.answer(observation)[:, 0]
 
 
-def onnx_force(model: bytes, observation: Float32Array) -> Float32Array:
-    """Return the force [N], shape (B,), that ONNX Runtime gives for observations (B, 13).
+def _call(source: Source) -> str:
+    """Return the C call that answers the i-th observation."""
+    function = f"{source.name.replace('-', '_')}_observation"
+    row = f"observations + {source.inputs} * i"
+    if isinstance(source, SpacecraftSource):
+        slots = f"{source.layout.neighbours}, {source.layout.obstacles}"
+        return f"{function}({row}, {slots}, answers + {source.outputs} * i)"
+    return f"answers[i] = {function}({row})"
+
+
+def onnx_function(model: bytes) -> Callable[[Float32Array], Float32Array]:
+    """Return ONNX Runtime's function of a model, on one thread: observations (B, o) to forces [N].
 
     Raises:
         ImportError: ONNX Runtime is not installed.
@@ -112,14 +126,26 @@ def onnx_force(model: bytes, observation: Float32Array) -> Float32Array:
     try:
         onnxruntime = importlib.import_module("onnxruntime")
     except ImportError as error:
-        raise ImportError(
-            "running an ONNX file needs ONNX Runtime: pip install onnxruntime"
-        ) from error
+        raise ImportError(f"running an ONNX file needs ONNX Runtime: {INSTALL}") from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    answer: Float32Array = session.run(["force"], {"observation": observation})[0]
-    return answer[:, 0]
+
+    def answer(observation: Float32Array) -> Float32Array:
+        forces: Float32Array = session.run(None, {"observation": observation})[0]
+        return forces
+
+    return answer
+
+
+def onnx_answer(model: bytes, observation: Float32Array) -> Float32Array:
+    """Return the forces [N], shape (B, outputs), of observations (B, o); see `onnx_function`."""
+    return onnx_function(model)(observation)
+
+
+def onnx_force(model: bytes, observation: Float32Array) -> Float32Array:
+    """Return the force [N] of the cart-pole, shape (B,), as `onnx_answer`."""
+    return onnx_answer(model, observation)[:, 0]
 
 
 @dataclass(frozen=True)
@@ -146,20 +172,21 @@ class Agreement:
         return f"{self.largest_difference:.1e} N at forces up to {self.largest_force:.1f} N"
 
 
-def agreement(forces: Float32Array, source: NetworkSource, observation: Float32Array) -> Agreement:
-    """Compare forces (B,) [N] with those of the NumPy policy for observations (B, 13)."""
-    wanted = source.force(observation).astype(np.float64)
-    return Agreement(float(np.max(np.abs(forces - wanted))), float(np.max(np.abs(wanted))))
+def agreement(answers: Float32Array, source: Source, observation: Float32Array) -> Agreement:
+    """Compare forces (B, outputs), or (B,) of one, [N] with the NumPy policy's for (B, o)."""
+    wanted = source.answer(observation).astype(np.float64)
+    difference = np.abs(answers.reshape(wanted.shape) - wanted)
+    return Agreement(float(np.max(difference)), float(np.max(np.abs(wanted))))
 
 
-def check_c(text: str, source: NetworkSource, count: int = 1000) -> Agreement:
+def check_c(text: str, source: Source, count: int = 1000) -> Agreement:
     """Compare a C file with NumPy over random observations; raises as `CompiledPolicy`."""
-    observation = example_observations(count, seed=1)
+    observation = source.examples(count, seed=1)
     with CompiledPolicy(text, source) as compiled:
-        return agreement(compiled.force(observation), source, observation)
+        return agreement(compiled.answer(observation), source, observation)
 
 
-def check_onnx(model: bytes, source: NetworkSource, count: int = 1000) -> Agreement:
-    """Compare an ONNX model with NumPy over random observations; raises as `onnx_force`."""
-    observation = example_observations(count, seed=1)
-    return agreement(onnx_force(model, observation), source, observation)
+def check_onnx(model: bytes, source: Source, count: int = 1000) -> Agreement:
+    """Compare an ONNX model with NumPy over random observations; raises as `onnx_answer`."""
+    observation = source.examples(count, seed=1)
+    return agreement(onnx_answer(model, observation), source, observation)

@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
 from lagros_envs.observation import Layout
-from lagros_envs.scenarios import Preset, preset_named
+from lagros_envs.scenarios import Preset
 from lagros_policies.contraction.thrusters import allocate
 from lagros_policies.imitation.deep_set import DeepSet
 from lagros_policies.imitation.network_policy import PRETRAINED
 from lagros_policies.imitation.spacecraft_features import SpacecraftFeatures, spacecraft_features
 from lagros_policies.policy import PolicyState
 from lagros_policies.sensed import Sensed
+from lagros_policies.spacecraft_setup import task_and_preset
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -52,8 +53,7 @@ class SpacecraftNetworkPolicy:
         weights: Path | str | None = None,
     ) -> None:
         """Load the network."""
-        self.settings = settings or task.SpacecraftSettings()
-        self.preset = preset_named(preset).for_agents(num_agents)
+        self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
         self.network = DeepSet.load(PRETRAINED / self.weights_file if weights is None else weights)
         core = self.preset.core_radius

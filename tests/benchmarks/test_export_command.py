@@ -20,7 +20,7 @@ def invoke(tmp_path, monkeypatch):
 
 @pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
 def test_c_is_written_under_the_name_of_the_policy(invoke, tmp_path):
-    result = invoke("learned-cartpole", "--tanh", "rational")
+    result = invoke("learned-cartpole")
     assert result.exit_code == 0, result.output
     assert "wrote learned_cartpole.c" in result.stdout
     assert "differs from NumPy, over 1000 observations, by at most" in result.stdout
@@ -31,6 +31,37 @@ def test_c_is_written_under_the_name_of_the_policy(invoke, tmp_path):
     rows = example_observations(50)
     with check.CompiledPolicy(text, source) as compiled:
         np.testing.assert_allclose(compiled.force(rows), source.force(rows), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
+def test_tanh_of_libm_on_request(invoke, tmp_path):
+    result = invoke("lagros-cartpole", "--tanh", "libm", "--out", "own.c")
+    assert result.exit_code == 0, result.output
+    assert "tanhf(" in (tmp_path / "own.c").read_text()
+
+
+@pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
+def test_c_of_the_spacecraft_has_the_radii_of_the_preset(invoke, tmp_path):
+    result = invoke("lagros-spacecraft", "--preset", "released", "--agents", "3")
+    assert result.exit_code == 0, result.output
+    assert "differs from NumPy, over 1000 observations, by at most" in result.stdout
+    source = load_source("lagros-spacecraft", preset="released", num_agents=3)
+    text = (tmp_path / "lagros_spacecraft.c").read_text()
+    rows = source.examples(50, seed=2)
+    with check.CompiledPolicy(text, source) as compiled:
+        np.testing.assert_allclose(compiled.answer(rows), source.answer(rows), rtol=1e-5, atol=2e-6)
+        paper = load_source("lagros-spacecraft", num_agents=3)
+        assert check.agreement(compiled.answer(rows), paper, rows).relative > 1e-3
+
+
+@pytest.mark.skipif(not check.has_onnxruntime(), reason="no onnxruntime")
+def test_onnx_of_the_spacecraft_takes_the_observation_of_so_many_agents(invoke, tmp_path):
+    result = invoke("learned-spacecraft", "--format", "onnx", "--agents", "3")
+    assert result.exit_code == 0, result.output
+    source = load_source("learned-spacecraft", num_agents=3)
+    rows = source.examples(50, seed=2)
+    forces = check.onnx_answer((tmp_path / "learned_spacecraft.onnx").read_bytes(), rows)
+    assert check.agreement(forces, source, rows).relative < 1e-6
 
 
 @pytest.mark.skipif(not check.has_onnxruntime(), reason="no onnxruntime")
@@ -51,13 +82,14 @@ def test_onnx_of_own_weights_is_written_where_asked(invoke, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["c", "onnx"])
-def test_what_cannot_be_compared_is_written_and_said(invoke, tmp_path, monkeypatch, kind):
+@pytest.mark.parametrize("task", ["cartpole", "spacecraft"])
+def test_what_cannot_be_compared_is_written_and_said(invoke, tmp_path, monkeypatch, task, kind):
     monkeypatch.setattr(check, "compiler", lambda: None)
     monkeypatch.setattr(check, "has_onnxruntime", lambda: False)
-    result = invoke("lagros-cartpole", "--format", kind)
+    result = invoke(f"lagros-{task}", "--format", kind)
     assert result.exit_code == 0, result.output
     assert "not compared with NumPy: " in result.stdout
-    assert (tmp_path / f"lagros_cartpole.{kind}").is_file()
+    assert (tmp_path / f"lagros_{task}.{kind}").is_file()
 
 
 @pytest.mark.parametrize("difference", [1.0, float("nan")])
@@ -75,9 +107,14 @@ def test_a_file_that_disagrees_is_not_written(invoke, tmp_path, monkeypatch, dif
     [
         (("lqr",), "choose one of lagros-cartpole, learned-cartpole"),
         (("lagros-cartpole", "--format", "h"), "--format: 'h' must be one of c, onnx"),
-        (("lagros-cartpole", "--tanh", "fast"), "--tanh: 'fast' must be one of libm, rational"),
+        (("lagros-cartpole", "--tanh", "fast"), "--tanh: 'fast' must be one of rational, libm"),
         (("lagros-cartpole", "--format", "onnx", "--tanh", "rational"), "leave it out for onnx"),
         (("lagros-cartpole", "--weights", "none.safetensors"), "no weight file"),
+        (("lagros-cartpole", "--agents", "3"), "leave them out for the cart-pole"),
+        (("lagros-spacecraft", "--tanh", "libm"), "the spacecraft's network has no tanh"),
+        (("lagros-spacecraft", "--preset", "moon"), "preset='moon' is not known"),
+        (("lagros-spacecraft", "--agents", "0"), "num_agents=0 must be at least 1"),
+        (("lagros-spacecraft", "--weights", "none.safetensors"), "no weight file"),
     ],
 )
 def test_a_mistake_is_explained_with_status_2_and_no_traceback(invoke, arguments, message):
