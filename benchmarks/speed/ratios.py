@@ -346,9 +346,9 @@ def _processes(scale: Scale) -> Duel:
         # With more than one job a serial pass for the step times follows: one episode of it.
         settings = BenchmarkSettings(
             policies=("tube-mpc", "lagros"),
-            episodes=2 * scale.tracked_episodes,
+            episodes=4 * scale.tracked_episodes,
             jobs=jobs,
-            chunk=max(1, scale.tracked_episodes // 4),
+            chunk=max(1, scale.tracked_episodes // 2),
             timing_episodes=1,
         )
         return lambda _: run_benchmark(settings) and None

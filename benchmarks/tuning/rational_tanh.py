@@ -8,7 +8,7 @@ without fused multiplication, on every float32 from 2⁻²⁰ to 16; below, P/Q 
 
     OMP_NUM_THREADS=1 python benchmarks/tuning/rational_tanh.py [--every N]
 
-prints the coefficients, as in lagros_policies/export/c99.py, and their largest relative error.
+prints the coefficients, as in lagros_policies/export/c_layers.py, and their largest relative error.
 """
 
 from __future__ import annotations

@@ -164,17 +164,17 @@ def spacecraft_model(source: SpacecraftSource) -> bytes:
 def _own_features(graph: _Graph, source: SpacecraftSource, own: str) -> tuple[Vector, str]:
     """Return the axis to the goal and what the agent knows of itself, shape (batch, 1, 9)."""
     goal = graph.pair(own, 0)
-    goal = (graph.do("Add", goal[0], features._SMALL), goal[1])
+    goal = (graph.do("Add", goal[0], features.SMALL), goal[1])
     distance = graph.length(goal)
     ahead = (graph.do("Div", goal[0], distance), graph.do("Div", goal[1], distance))
     course = graph.turned_back(graph.pair(own, 2), ahead)
     left = graph.do("Sub", source.policy.settings.horizon, graph.columns(own, [8]))
     needed = graph.do("Max", graph.do("Div", distance, CRUISE_SPEED), LEAST_TIME)
     left = graph.do("Max", needed, left)
-    soon = float(features._TIMES[1])
+    soon = float(features.TIMES[1])
     columns = (
         distance,
-        graph.do("Min", distance, float(features._DISTANCES[1])),
+        graph.do("Min", distance, float(features.DISTANCES[1])),
         *course,
         left,
         graph.do("Min", left, soon),
@@ -204,10 +204,10 @@ def _pooled(
     """
     apart, motion = (graph.turned_back(vector, ahead) for vector in body)
     touch, rim = distances
-    centre = graph.do("Add", graph.length(apart), features._SMALL)
+    centre = graph.do("Add", graph.length(apart), features.SMALL)
     unit = (graph.do("Div", apart[0], centre), graph.do("Div", apart[1], centre))
     gap = graph.do("Sub", centre, touch)
-    near = features._NEAR
+    near = features.NEAR
     nearness = graph.do("Exp", graph.do("Div", graph.do("Max", gap, -near), -near))
     closing = graph.do("Neg", graph.sum_of_products(unit, motion))
     # What does not differ among the slots takes their shape.
@@ -216,7 +216,7 @@ def _pooled(
     if kind == "obstacle":
         columns.append(touch)
     values = graph.do("Concat", *columns, axis=2)
-    fading = graph.do("Div", graph.do("Sub", rim, centre), features._FADE)
+    fading = graph.do("Div", graph.do("Sub", rim, centre), features.FADE)
     weight = graph.do("Max", graph.do("Min", fading, 1.0), 0.0)
     layout = source.layout
     mask = graph.part(

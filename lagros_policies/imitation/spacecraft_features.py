@@ -44,11 +44,11 @@ NEIGHBOUR = (
 )
 OBSTACLE = (*NEIGHBOUR, "distance of the centres at touch [m]")
 
-_SMALL = 1e-9  # [m]
-_DISTANCES = np.array([np.inf, 0.5])  # up to which the distance to the goal counts [m]
-_TIMES = np.array([np.inf, 5.0])  # up to which the time to go counts [s]
-_NEAR = 0.3  # scale of nearness = exp(-gap / _NEAR) [m]
-_FADE = 0.4  # what is sensed counts in full this far inside the sensing radius [m]
+SMALL = 1e-9  # [m]
+DISTANCES = np.array([np.inf, 0.5])  # up to which the distance to the goal counts [m]
+TIMES = np.array([np.inf, 5.0])  # up to which the time to go counts [s]
+NEAR = 0.3  # scale of nearness = exp(-gap / NEAR) [m]
+FADE = 0.4  # what is sensed counts in full this far inside the sensing radius [m]
 
 
 class Elements(NamedTuple):
@@ -95,16 +95,16 @@ def spacecraft_features(
     """
     goal, course = _complex(sensed.goal), _complex(sensed.velocity)
     # A shift that no observation, in single precision, can undo: nothing is divided by zero.
-    shifted = goal + _SMALL
+    shifted = goal + SMALL
     distance = np.abs(shifted)
     frame = shifted / distance
     back = frame.conj()
     left = time_to_go(distance, settings.horizon - sensed.time)
     own = np.empty((len(goal), len(OWN)), np.float32)
-    np.minimum(distance[:, None], _DISTANCES, out=own[:, 0:2])
+    np.minimum(distance[:, None], DISTANCES, out=own[:, 0:2])
     own[:, 2:4] = _pairs(course * back)
-    np.minimum(left[:, None], _TIMES, out=own[:, 4:6])
-    np.divide(distance, left + _TIMES[1], out=own[:, 6])
+    np.minimum(left[:, None], TIMES, out=own[:, 4:6])
+    np.divide(distance, left + TIMES[1], out=own[:, 6])
     own[:, 7:9] = sensed.own[:, 6:8]  # turn and spin
     # Neighbours first, then obstacles: one table for both.
     whose, slot = sensed.neighbour_mask.nonzero()
@@ -124,17 +124,17 @@ def spacecraft_features(
     touch[:first], rim[:first] = 2.0 * agent_radius, settings.sensing_radius
     np.add(discs[:, 2], core_radius, out=touch[first:])
     np.add(discs[:, 2], settings.sensing_radius, out=rim[first:])
-    centre = np.abs(apart) + _SMALL
+    centre = np.abs(apart) + SMALL
     unit, gap = apart / centre, centre - touch
     table = np.empty((count, len(OBSTACLE)), np.float32)
     table[:, 0:2] = _pairs(unit)
     table[:, 2] = gap
     # Deep inside another body nearness would explode.
-    np.exp(np.maximum(gap, -_NEAR) * (-1.0 / _NEAR), out=table[:, 3])
+    np.exp(np.maximum(gap, -NEAR) * (-1.0 / NEAR), out=table[:, 3])
     table[:, 4:6] = moving.view(np.float64)[:, 2:]
     table[:, 6] = (unit.conj() * -motion).real
     table[:, 7] = touch
-    weight = np.minimum((rim - centre) * (1.0 / _FADE), 1.0)
+    weight = np.minimum((rim - centre) * (1.0 / FADE), 1.0)
     weight = np.maximum(weight, 0.0).astype(np.float32)
     return SpacecraftFeatures(
         own,
