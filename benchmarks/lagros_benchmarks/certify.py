@@ -147,7 +147,8 @@ def certify_cartpole(
         control_error=met,
     )
     tubes = evidence.cartpole_tubes(task.system, bound)
-    found = cartpole_certificate(task.system, metric, question, proofs, tubes)
+    held = evidence.cartpole_held_tubes(task.system, bound)
+    found = cartpole_certificate(task.system, metric, question, proofs, tubes, held)
     # Nothing is held against a metric that is none.
     if flights is None or found.tube.certified is None:
         return found.with_evidence(lines)

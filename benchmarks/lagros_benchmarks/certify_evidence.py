@@ -18,6 +18,7 @@ from lagros_policies.contraction import Metric, Samples
 from lagros_policies.contraction.certificate import Certificate
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.double_integrator import AxisMetric
+from lagros_policies.contraction.held_design import HeldDesign, HeldTube, design_held_contained
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.statement import Statement
 from lagros_policies.contraction.theorems import contraction_distance
@@ -127,6 +128,29 @@ def cartpole_tubes(system: CartPole, bound: float) -> list[ConstantTube]:
     for plan, design in wanted:
         try:
             tubes.append(design_contained(system, plan, design))
+        except (InfeasibleError, RuntimeError):
+            continue
+    return tubes
+
+
+def cartpole_held_tubes(system: CartPole, bound: float) -> list[HeldTube]:
+    """Design the tubes of a held control: near the upright, and for all settled plans.
+
+    Where there is none that keeps itself in its box, there is no claim.
+
+    Args:
+        system: The cart-pole.
+        bound: d_bar of the first, whose control is held for 20 ms; the second is for `PAPER_BOUND`,
+            held for the 0.1 s of the task.
+    """
+    wanted = [
+        (_UPRIGHT, HeldDesign(0.02, 0.4, _ANGLE, disturbance_bound=bound, degree=3)),
+        (_SETTLED, HeldDesign(0.1, 0.5, _ANGLE, disturbance_bound=PAPER_BOUND, degree=5)),
+    ]
+    tubes = []
+    for plan, design in wanted:
+        try:
+            tubes.append(design_held_contained(system, plan, design))
         except (InfeasibleError, RuntimeError):
             continue
     return tubes

@@ -2,7 +2,8 @@
 
 Theorem 1 holds while the state stays in the box on which the condition was proved; it does not say
 that it stays there. So there are two kinds of tube here: the paper's, conditional on that, and
-those of `tube_design`, which keep the state in their box by themselves.
+those of `tube_design` and, for a control that is held, of `held_design`, which keep the state in
+their box by themselves.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.certificate import Certificate, Stopwatch, TubeSizes
 from lagros_policies.contraction.cvstem import Samples
 from lagros_policies.contraction.ellipsoid import prove_tube
+from lagros_policies.contraction.held_design import HeldTube
+from lagros_policies.contraction.held_ellipsoid import held_statement, prove_held_tube
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.proof.condition import (
@@ -77,6 +80,7 @@ def cartpole_certificate(
     question: CartPoleQuestion,
     proofs: Sequence[Statement] | None = None,
     tubes: Sequence[ConstantTube] = (),
+    held: Sequence[HeldTube] = (),
 ) -> Certificate:
     """Prove what can be proved of a metric and return it as a certificate.
 
@@ -88,6 +92,7 @@ def cartpole_certificate(
         question: What is asked.
         proofs: Statements that the condition holds on the box; proved here if None.
         tubes: Tubes of constant metrics to prove as well.
+        held: Tubes of a held control, likewise.
     """
     watch = Stopwatch()
     lines = list(_contraction(system, metric, question) if proofs is None else proofs)
@@ -124,6 +129,9 @@ def cartpole_certificate(
     lemma, lipschitz = _lemma(system, question, bounds)
     lines.append(lemma)
     lines.extend(_constant_line(system, constant, question.most_seconds) for constant in tubes)
+    lines.extend(
+        held_statement(tube, prove_held_tube(system, tube, question.most_seconds)) for tube in held
+    )
     return Certificate(
         task="cartpole",
         policy=question.policy,
@@ -146,6 +154,7 @@ def cartpole_certificate(
             "control_error": question.error,
             "largest_disturbance_of_the_angle": 2.0 * alpha / drift if drift > 0.0 else None,
             "tubes": [tube_record(constant) for constant in tubes],
+            "held_tubes": [held_record(tube) for tube in held],
         },
     )
 
@@ -190,6 +199,27 @@ def tube_record(tube: ConstantTube) -> dict[str, object]:
         "plan": {name: getattr(tube.plan, name) for name in tube.plan.__dataclass_fields__},
         "region": {name: list(ends) for name, ends in region_of(box).items()},
         "W": tube.dual.tolist(),
+    }
+
+
+def held_record(tube: HeldTube) -> dict[str, object]:
+    """Return a tube of a held control as what JSON can hold; `Q` are Bernstein's coefficients."""
+    names = ("p", "theta", "p_dot", "theta_dot")
+    design = tube.design
+    return {
+        "output": None if design.output is None else list(design.output),
+        "alpha": design.rate,
+        "d_bar": design.disturbance_bound,
+        "hold": design.period,
+        "shorter_holds_too": design.aperiodic,
+        "radius": tube.steady_radius,
+        "outputs": dict(zip(names, tube.steady_outputs.tolist(), strict=True)),
+        "deviation": tube.largest_deviation,
+        "contained": tube.contained,
+        "plan": {name: getattr(tube.plan, name) for name in tube.plan.__dataclass_fields__},
+        "region": {name: list(ends) for name, ends in region_of(tube.proof_box).items()},
+        "K": tube.gain.tolist(),
+        "Q": tube.duals.tolist(),
     }
 
 

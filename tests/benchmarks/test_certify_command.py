@@ -30,6 +30,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(certify_evidence, "SMALL_BOX", box)
     monkeypatch.setattr(certify_evidence, "metric_to_prove", lambda path: (path, False))
     monkeypatch.setattr(certify_evidence, "cartpole_tubes", lambda system, bound: [])
+    monkeypatch.setattr(certify_evidence, "cartpole_held_tubes", lambda system, bound: [])
 
 
 def test_the_spacecraft_is_certified_without_flights(invoke, tmp_path):

@@ -1,0 +1,132 @@
+"""Proof of a tube of a held control, at the control instants and between them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.dynamics import CartPole
+from lagros_policies.contraction.held_design import HeldTube, bernstein_rate
+from lagros_policies.contraction.proof.cells import Search, search
+from lagros_policies.contraction.proof.intervals import (
+    Interval,
+    exact,
+    matmul,
+    negative_definite,
+    transpose,
+)
+from lagros_policies.contraction.proof.lifted import LiftedCondition
+from lagros_policies.contraction.proof.rates import Violation
+from lagros_policies.contraction.statement import Statement
+
+FloatArray = NDArray[np.float64]
+
+_STATES = 4
+# Cells of one pass, and of a whole search.
+_BATCH = 100
+_MOST_CELLS = 100_000
+
+
+@dataclass(frozen=True)
+class HeldTubeProof:
+    """What the proof of a tube of a held control came to.
+
+    Attributes:
+        tube: The tube asked about.
+        conditions: The searches for a proof of (*) for each coefficient; up to the first that was
+            not proved.
+        jumps: Whether V does not rise at an instant, (**).
+        proved: Whether the tube is proved: (*), (**), every Q_i positive definite, and the tube
+            inside the box.
+        seconds: Time taken [s].
+    """
+
+    tube: HeldTube
+    conditions: tuple[Search[Violation], ...]
+    jumps: bool
+    proved: bool
+    seconds: float
+
+    @property
+    def cells(self) -> int:
+        """Cells examined."""
+        return sum(one.cells for one in self.conditions)
+
+
+def prove_held_tube(system: CartPole, tube: HeldTube, most_seconds: float = 60.0) -> HeldTubeProof:
+    """Prove the tube of a held control, or say that there is no proof.
+
+    What is proved: for every target trajectory in `tube.plan`, from e(0) = 0, under every
+    disturbance (with what a learning error adds) of norm at most w_bar, which may change within a
+    hold, and under u = u_d + K e(t_k) held for h (for at most h with `aperiodic`), |c'e(t)| <=
+    tube.output_radius(c, t) at every time t. It is a statement on the exact motion.
+
+    Args:
+        system: A cart-pole.
+        tube: The tube.
+        most_seconds: Processor time after which each of N + 1 searches gives up [s].
+
+    Returns:
+        The proof.
+    """
+    start = time.monotonic()
+    definite = bool(np.all(negative_definite(exact(-tube.duals))))
+    jumps = _falls_at_instants(tube)
+    found: list[Search[Violation]] = []
+    if definite and jumps and tube.contained:
+        for dual, rest in zip(tube.duals, _rests(tube), strict=True):
+            condition = LiftedCondition(system, tube.proof_box, dual, rest)
+            found.append(search(condition, _BATCH, _MOST_CELLS, most_seconds))
+            if not found[-1].proved:
+                break
+    proved = len(found) == len(tube.duals) and found[-1].proved
+    return HeldTubeProof(tube, tuple(found), jumps, proved, time.monotonic() - start)
+
+
+def held_statement(tube: HeldTube, proof: HeldTubeProof) -> Statement:
+    """Return a tube of a held control as a line of a certificate."""
+    p, angle = tube.steady_outputs[[0, 1]]
+    plan, design = tube.plan, tube.design
+    holds = "holds of at most" if design.aperiodic else "held"
+    return Statement(
+        f"ellipsoid tube, control {holds} {design.period:g} s, at the instants and between them, "
+        f"all disturbances up to {design.disturbance_bound:g}, e(0) = 0: |theta - theta_d| "
+        f"<= {angle:.4g} rad, |p - p_d| <= {p:.4g} m, ||e|| <= {tube.steady_radius:.4g}, "
+        f"|u - u_d| <= {tube.largest_deviation:.4g} N for u = u_d + K e, K = "
+        f"{np.round(tube.gain[0], 3).tolist()}; it keeps the state in its box while |theta_d| <= "
+        f"{plan.angle:g} rad, |p_d'| <= {plan.velocity:g} m/s, |theta_d'| <= "
+        f"{plan.angular_rate:g} rad/s and |u_d| <= {plan.force:g} N",
+        "proved",
+        proof.proved,
+        proof.seconds,
+    )
+
+
+def _falls_at_instants(tube: HeldTube) -> bool:
+    """Show Q_0 > L W L' with L = (I; K) for every W of an instant."""
+    joined = exact(np.concatenate([np.eye(_STATES), tube.gain]))
+    indices = range(1, len(tube.duals)) if tube.design.aperiodic else [len(tube.duals) - 1]
+    for index in indices:
+        block = exact(tube.duals[index, :_STATES, :_STATES])
+        moved = matmul(matmul(joined, block), transpose(joined))
+        if not negative_definite(moved - tube.duals[0]):
+            return False
+    return True
+
+
+def _rests(tube: HeldTube) -> list[Interval]:
+    """Enclose 2 alpha Q_i - (dQ/ds)_i + w_bar^2 / (2 alpha) E E', each (5, 5)."""
+    design = tube.design
+    period, rate = exact(design.period), exact(design.rate)
+    source = exact(design.disturbance_bound).square() / (rate * 2.0)
+    pushed = np.diag([1.0] * _STATES + [0.0])
+    rests = []
+    for index, row in enumerate(bernstein_rate(design.degree)):
+        total = exact(tube.duals[index]) * (rate * 2.0) + source * pushed
+        for place, weight in row.items():
+            total = total - exact(tube.duals[place]) * weight / period
+        rests.append(total)
+    return rests

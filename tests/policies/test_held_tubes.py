@@ -1,0 +1,270 @@
+"""The tube of a held control: its program, its proof, and flights that try to leave it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import BPoly
+
+from lagros_policies.contraction import load_metric
+from lagros_policies.contraction.certificate_cartpole import (
+    CartPoleQuestion,
+    cartpole_certificate,
+)
+from lagros_policies.contraction.cvstem import InfeasibleError
+from lagros_policies.contraction.held_design import (
+    HeldDesign,
+    bernstein_rate,
+    design_held_contained,
+)
+from lagros_policies.contraction.held_ellipsoid import held_statement, prove_held_tube
+from lagros_policies.contraction.proof.box import ProofBox
+from lagros_policies.contraction.proof.intervals import exact
+from lagros_policies.contraction.proof.lifted import LiftedCondition
+from lagros_policies.contraction.tube_design import PlanBox
+
+PLAN = PlanBox(angle=0.05, velocity=0.3, angular_rate=0.1, force=0.3)
+BOUND, PERIOD = 0.1, 0.1
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["periodic", "aperiodic"])
+def tube(request, system):
+    design = HeldDesign(
+        period=PERIOD, disturbance_bound=BOUND, degree=3, aperiodic=request.param, rate=0.5
+    )
+    return design_held_contained(system, PLAN, design)
+
+
+def test_it_is_proved_and_says_so(system, tube):
+    proof = prove_held_tube(system, tube, 60.0)
+    assert proof.proved
+    line = held_statement(tube, proof)
+    assert line.holds
+    assert line.kind == "proved"
+    assert f"{tube.steady_outputs[1]:.4g} rad" in line.text
+    # Worth having: below ten times the disturbance, in spite of the hold.
+    assert tube.steady_radius < 10 * BOUND
+
+
+def test_spoiled_tubes_are_refused(system, tube):
+    more = replace(tube.design, disturbance_bound=1.2 * BOUND)
+    longer = replace(tube.design, period=1.2 * PERIOD)
+    for spoiled in (
+        replace(tube, duals=0.9 * tube.duals),
+        replace(tube, design=more),
+        replace(tube, design=longer),
+        replace(tube, design=replace(tube.design, rate=1.2 * tube.design.rate)),
+        replace(tube, gain=0.9 * tube.gain),
+        replace(tube, error=0.9 * tube.error),
+        replace(tube, plan=replace(PLAN, angle=0.6), error=tube.error),
+    ):
+        assert not prove_held_tube(system, spoiled, 5.0).proved
+
+
+def draw(tube, count, seed):
+    """Return (x, x_d, u_d) with x_d in the plan's box and e anywhere in the box of errors."""
+    rng = np.random.default_rng(seed)
+    nominal = rng.uniform(-1, 1, (count, 4)) * [1.0, PLAN.angle, PLAN.velocity, PLAN.angular_rate]
+    error = rng.uniform(-1, 1, (count, 4)) * np.maximum(tube.error, [1.0, 0, 0, 0])
+    return nominal + error, nominal, rng.uniform(-1, 1, (count, 1)) * PLAN.force
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.37, 0.8, 1.0])
+def test_the_condition_holds_inside_the_hold_by_the_definition_of_the_sdc_matrix(
+    tube, phase, oracle
+):
+    state, nominal, control = draw(tube, 200, 0)
+    lifted = np.zeros((200, 5, 5))
+    lifted[:, :4, :4] = oracle.sdc(state, nominal, control)
+    lifted[:, :4, 4:] = oracle.input_matrix(state)
+    step = 1e-6
+    ahead, behind = (tube.dual_at(phase + sign * step) for sign in (1, -1))
+    slope = (ahead - behind) / (2 * step * PERIOD)
+    rate, dual = tube.design.rate, tube.dual_at(phase)
+    product = lifted @ dual
+    left = product + np.swapaxes(product, 1, 2) + 2 * rate * dual - slope
+    left += BOUND**2 / (2 * rate) * np.diag([1.0, 1, 1, 1, 0])
+    assert np.linalg.eigvalsh(left).max() < 0.0
+
+
+def test_the_rate_of_a_bernstein_polynomial_is_that_of_the_polynomial():
+    rng = np.random.default_rng(1)
+    for degree in (1, 2, 5):
+        values = rng.standard_normal(degree + 1)
+        s = np.linspace(0.0, 1.0, 7)
+        slope = BPoly(values[:, None], [0.0, 1.0]).derivative()(s)
+        rates = [sum(w * values[i] for i, w in row.items()) for row in bernstein_rate(degree)]
+        raised = BPoly(np.array(rates)[:, None], [0.0, 1.0])(s)
+        assert raised == pytest.approx(slope, abs=1e-12)
+
+
+def test_the_energy_does_not_rise_when_the_force_is_renewed(tube):
+    rng = np.random.default_rng(2)
+    error, old = rng.standard_normal((500, 4)), 30 * rng.standard_normal((500, 1))
+    before = tube.energy(1.0, error, old)
+    after = tube.energy(0.0, error, error @ tube.gain.T)
+    assert np.all(after <= before)
+
+
+@pytest.mark.parametrize("kind", ["steepest", "ahead", "constant", "switching"])
+def test_no_flight_leaves_the_tube_at_any_time(tube, kind, oracle):
+    """Disturbances that may change every 5 ms; the tube is looked at every 5 ms too."""
+    rng = np.random.default_rng(4)
+    count, parts = 40, 20
+    fine = PERIOD / parts
+    nominal = rng.uniform(-0.5, 0.5, (count, 4)) * [0.02, 0.01, 0.05, 0.02]
+    held = rng.standard_normal((8, count, 4))
+    held /= np.linalg.norm(held, axis=2, keepdims=True)
+    state, reached = nominal.copy(), 0.0
+    # Where e is bound to end if nothing disturbs: what the push should lean on (kind "ahead").
+    last = np.linalg.inv(tube.dual_at(1.0))
+    for hold in range(16):
+        # A target that balances itself and is moved about.
+        control = nominal @ tube.gain.T + rng.uniform(-0.03, 0.03, (count, 1))
+        control = np.clip(control, -PLAN.force, PLAN.force)
+        force = tube.control(state, nominal, control)
+        limits = [np.inf, PLAN.angle, PLAN.velocity, PLAN.angular_rate]
+        assert np.all(np.abs(nominal) <= limits)
+        for part in range(parts):
+            z = np.concatenate([state - nominal, force - control], axis=1) + 1e-12
+            inverse = np.linalg.inv(tube.dual_at(part / parts)) if kind == "steepest" else last
+            pull = (z @ inverse)[:, :4]
+            push = {
+                "constant": held[0],
+                "switching": held[(hold * parts + part) // 7 % 8],
+            }.get(kind, pull / np.linalg.norm(pull, axis=1, keepdims=True))
+            state = oracle.step(state, force, fine, 1, BOUND * push)
+            nominal = oracle.step(nominal, control, fine, 1)
+            time, error = hold * PERIOD + (part + 1) * fine, state - nominal
+            energy = tube.energy((part + 1) / parts, error, force - control)
+            assert np.all(energy <= tube.share(time) ** 2 * (1 + 1e-6))
+            assert np.all(np.linalg.norm(error, axis=1) <= tube.steady_radius)
+            for output in np.eye(4):
+                assert np.all(np.abs(error @ output) <= tube.output_radius(output, time))
+            reached = max(reached, float(energy.max()))
+        assert np.all(np.abs(force - control) <= tube.largest_deviation)
+    # The test says something: the steepest push uses much of the tube.
+    assert reached > (0.3 if kind == "steepest" else 0.01)
+
+
+@pytest.mark.parametrize("tube", [True], indirect=True, ids=["aperiodic"])
+def test_shorter_holds_stay_inside_an_aperiodic_tube(tube, oracle):
+    rng = np.random.default_rng(5)
+    state, nominal = np.zeros((40, 4)), np.zeros((40, 4))
+    held, time, parts = np.zeros((40, 1)), 0.0, 20
+    for _ in range(60):
+        force = tube.control(state, nominal, held)
+        for part in range(int(rng.integers(1, parts + 1))):
+            phase = part / parts
+            z = np.concatenate([state, force], axis=1) + 1e-12
+            pull = (z @ np.linalg.inv(tube.dual_at(phase)))[:, :4]
+            push = pull / np.linalg.norm(pull, axis=1, keepdims=True)
+            state = oracle.step(state, force, PERIOD / parts, 1, BOUND * push)
+            time += PERIOD / parts
+            energy = tube.energy(phase + 1 / parts, state, force)
+            assert np.all(energy <= tube.share(time) ** 2 * (1 + 1e-6))
+
+
+def test_the_lifted_condition_encloses_what_it_speaks_of(system, oracle):
+    """Inside a cell, against the matrix of the oracle's Jacobian: interpolation and remainder."""
+    box = ProofBox(0.4, 1.0, 1.5, 2.0, angle_error=0.3, angular_rate_error=0.5)
+    dual = np.cov(np.random.default_rng(6).standard_normal((5, 12)))
+    condition = LiftedCondition(system, box, dual, exact(np.zeros((5, 5))))
+    cells = condition.start()
+    found = condition.examine(cells)
+    corners = found.corners.midpoint.reshape(len(cells.lower), 8, 4, 5, 5)
+    reach = sum(np.maximum(np.abs(part.lower), np.abs(part.upper)) for part in found.remainders)
+    rng = np.random.default_rng(7)
+    bent = 0.0
+    for cell in rng.integers(0, len(cells.lower), 60):
+        first, second = rng.uniform(0, 1, 2)
+        low, width = cells.lower[cell], (cells.upper - cells.lower)[cell]
+        x, y = np.zeros(4), np.zeros(4)
+        x[1], y[1] = low + np.array([first, second]) * width
+        # Corners of what the matrix is affine in: -f or f; w, -w, then what is off the parabola.
+        push, turn = rng.integers(0, 2, 2)
+        y[2:] = (1 - 2 * push) * box.velocity, (1 - 2 * turn) * box.angular_rate
+        lifted = np.zeros((5, 5))
+        control = np.array([(2 * push - 1) * box.force])
+        lifted[:4, :4] = oracle.jacobian(lambda at, u=control: oracle.rates(at, u), y)
+        lifted[:4, 4:] = oracle.input_matrix(x)
+        weights = np.outer([1 - first, first], [1 - second, second]).ravel()
+        drawn = np.tensordot(weights, corners[cell, 4 * push + turn], axes=1)
+        gap = np.abs(lifted @ dual + dual @ lifted.T - drawn)
+        # The range of the rates is widened by a millionth.
+        assert np.all(gap <= reach[cell] + 1e-5)
+        bent = max(bent, float(gap.max()))
+    assert bent > 1e-3
+
+
+def test_rates_off_the_corners_are_between_them(system, oracle):
+    """The oracle's J at any rate is in the hull of those at the corners, in every direction."""
+    box = ProofBox(0.4, 1.0, 1.5, 2.0)
+    dual = np.cov(np.random.default_rng(6).standard_normal((5, 12)))
+    condition = LiftedCondition(system, box, dual, exact(np.zeros((5, 5))))
+    place = 0.3
+    corners = condition.examine(exact(np.array([[place, place]]))).corners.midpoint[0]
+    rng = np.random.default_rng(8)
+    for _ in range(100):
+        y = np.array([0.0, place, *rng.uniform(-1, 1, 2)]) * [1.0, 1.0, box.velocity, 1.5]
+        control = rng.uniform(-1, 1, 1) * box.force
+        lifted = np.zeros((5, 5))
+        lifted[:4, :4] = oracle.jacobian(lambda at, u=control: oracle.rates(at, u), y)
+        lifted[:4, 4:] = oracle.input_matrix(y)
+        form = lifted @ dual + dual @ lifted.T
+        direction = rng.standard_normal((50, 5))
+        values = np.einsum("di,vij,dj->dv", direction, corners, direction)
+        value = np.einsum("di,ij,dj->d", direction, form, direction)
+        assert np.all(value <= values.max(axis=1) + 1e-9)
+
+
+def test_a_disturbance_without_a_contained_tube_is_refused(system):
+    with pytest.raises(InfeasibleError, match="disturbance"):
+        design_held_contained(system, PLAN, HeldDesign(disturbance_bound=3.0, degree=3))
+
+
+def test_a_lean_is_refused(system):
+    box = ProofBox(0.4, 1.0, 1.5, 2.0, lean=1.0)
+    with pytest.raises(ValueError, match="lean"):
+        LiftedCondition(system, box, np.eye(5), exact(np.zeros((5, 5))))
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"period": 0.0}, "period"),
+        ({"rate": -1.0}, "rate"),
+        ({"disturbance_bound": float("nan")}, "disturbance_bound"),
+        ({"margin": -0.1}, "margin"),
+        ({"degree": 0}, "degree"),
+        ({"output": (1.0, 0.0)}, "output"),
+    ],
+)
+def test_values_out_of_range_are_refused(change, match):
+    with pytest.raises(ValueError, match=match):
+        HeldDesign(**change)
+
+
+@pytest.mark.parametrize("tube", [False], indirect=True, ids=["periodic"])
+def test_a_certificate_carries_the_tube_and_an_outsider_finds_it_kept(system, tube, oracle):
+    question = CartPoleQuestion(ProofBox(0.06, 0.3, 0.3, 0.3), BOUND, 0.0, 3.15)
+    found = cartpole_certificate(system, load_metric(), question, proofs=[], held=[tube])
+    assert found.holds
+    record = json.loads(json.dumps(found.as_json(), allow_nan=False))["held_tubes"][0]
+    coefficients, gain = np.array(record["Q"]), np.array(record["K"])
+    polynomial = BPoly(coefficients[:, None], [0.0, record["hold"]])
+    state = np.zeros((1, 4))
+    for _ in range(30):
+        force = state @ gain.T
+        for part in range(10):
+            time = record["hold"] * part / 10
+            pull = np.concatenate([state, force], axis=1) @ np.linalg.inv(polynomial(time)) + 1e-9
+            push = pull[:, :4] / np.linalg.norm(pull[:, :4])
+            state = oracle.step(state, force, record["hold"] / 10, 1, record["d_bar"] * push)
+            assert np.all(np.abs(state[0]) <= list(record["outputs"].values()))
+    assert np.abs(state[0, 1]) > 0.05 * record["outputs"]["theta"]
+    spoiled = replace(tube, duals=0.8 * tube.duals)
+    assert not cartpole_certificate(
+        system, load_metric(), question, proofs=[], held=[spoiled]
+    ).holds
