@@ -143,9 +143,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Check the coverage of the calibrated bounds.")
     parser.add_argument("--task", choices=("cartpole", "spacecraft"))
     parser.add_argument(
-        "--calibration", type=int, default=1000, help="episodes; worlds are a tenth"
+        "--calibration", type=int, default=4000, help="episodes; worlds are a tenth"
     )
-    parser.add_argument("--fresh-episodes", type=int, default=2000, help="likewise")
+    parser.add_argument("--fresh-episodes", type=int, default=8000, help="likewise")
     parser.add_argument("--fresh", action="store_true", help="forget the scores kept")
     parser.add_argument("--json", type=Path, default=Path("benchmarks/results/conformal.json"))
     options = parser.parse_args()
