@@ -35,6 +35,7 @@ _SPACECRAFT = {
     "tube-mpc": "lagros_policies.distributed:DistributedTubeMpcPolicy",
     "lagros": "lagros_policies.lagros:SpacecraftLagrosPolicy",
     "centralized": "lagros_policies.centralized:CentralizedPolicy",
+    "ppo": "lagros_policies.spacecraft_ppo:SpacecraftPpoPolicy",
 }
 NAMES = tuple(_CARTPOLE)
 SPACECRAFT_NAMES = tuple(_SPACECRAFT)

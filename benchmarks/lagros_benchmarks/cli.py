@@ -76,8 +76,8 @@ def bench(
         typer.Option(
             metavar="NAME[,NAME]",
             help="cartpole: of learned, tube-mpc, lagros, lqr, random, ppo, sac, td3, residual. "
-            "spacecraft: of learned, tube-mpc, lagros, centralized. Or a stable-baselines3 .zip, "
-            "or module:Class.",
+            "spacecraft: of learned, tube-mpc, lagros, centralized, ppo. Or a "
+            "stable-baselines3 .zip, or module:Class.",
         ),
     ] = None,
     episodes: Annotated[

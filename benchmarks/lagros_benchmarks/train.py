@@ -23,7 +23,7 @@ RUNS = Path("runs/train")
 
 
 def train(
-    task: Annotated[str, typer.Argument(help="cartpole, or spacecraft (preset open).")],
+    task: Annotated[str, typer.Argument(help="cartpole, or spacecraft (preset paper).")],
     algo: Annotated[
         str,
         typer.Option(metavar="NAME[,NAME]", help="cartpole: of ppo, sac, td3. spacecraft: ppo."),

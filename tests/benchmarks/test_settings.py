@@ -59,7 +59,8 @@ def test_the_cart_pole_has_no_settings_of_the_spacecraft(changes):
 def test_each_task_has_its_own_defaults():
     assert BenchmarkSettings.for_task("cartpole", bounds=None) == BenchmarkSettings()
     settings = BenchmarkSettings.for_task("spacecraft", episodes=None, jobs=2)
-    assert settings.policies == SPACECRAFT_NAMES
+    # The four of the paper; what reinforcement learning trained is asked for by name.
+    assert settings.policies == tuple(name for name in SPACECRAFT_NAMES if name != "ppo")
     assert settings.bounds == (0.2, 0.4, 0.6, 0.8, 1.0)
     assert (settings.preset, settings.agents, settings.jobs) == ("paper", (6,), 2)
     # Every policy with and without the filter.
@@ -101,7 +102,7 @@ def test_the_names_are_those_of_the_task():
         check_policy(name, "spacecraft")
     with pytest.raises(ValueError, match="unknown policy 'centralized'"):
         check_policy("centralized")
-    with pytest.raises(ValueError, match="Valid: learned, tube-mpc, lagros, centralized,"):
+    with pytest.raises(ValueError, match="Valid: learned, tube-mpc, lagros, centralized, ppo,"):
         check_policy("lqr", "spacecraft")
 
 

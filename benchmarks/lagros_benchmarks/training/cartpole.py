@@ -120,6 +120,9 @@ class CartPoleLesson:
             return ActorPolicy(weights=actor)
         return ResidualPolicy(weights=actor)
 
+    def begin(self, segment: int) -> None:
+        """Do nothing: all segments are alike."""
+
     def figures(self, model: BaseAlgorithm) -> dict[str, float]:
         """Return the figures of the agent on the held-out episodes of the learning curve."""
         run = self.training

@@ -40,6 +40,10 @@ class Lesson(Protocol):
 
     venv: VecEnv
 
+    def begin(self, segment: int) -> None:
+        """Prepare the worlds for a segment, from 0."""
+        ...
+
     def figures(self, model: BaseAlgorithm) -> dict[str, float]:
         """Return the figures of the agent on the held-out episodes of the learning curve."""
         ...
@@ -115,6 +119,7 @@ def train(
     model.set_logger(Logger(None, _outputs(place, model.num_timesteps)))
     for segment in range(len(curve), training.segments):
         begun = time.perf_counter(), time.process_time()
+        made.begin(segment)
         _learn_segment(training, model, segment)
         figures = rounded(made.figures(model))
         curve.append(_point(model, figures, begun, curve))

@@ -254,39 +254,67 @@ class SpacecraftTraining(Training):
     """A run with spacecraft, one policy for all; attributes as in `Training`, and these.
 
     Attributes:
-        effort_weight: That of the task.
-        preset: Preset of the scenarios. The agent sees no obstacles.
+        effort_weight: Higher than that of the task, as the weight of progress is.
+        preset: Preset of the scenarios.
         agents: Agents in each world.
         time_limit: Of an episode in training [s]: most of the 45 s of the task are spent at the
             goal, where there is little left to learn.
+        progress_weight: Replaces that of the task's reward in training.
+        goal_weight: Reward per second within the goal's radius.
         nearness_weight: Reward per second at a touch of another agent, negative sign applied.
         nearness_range: Distance beyond touching at which that has fallen to nothing [m].
+        obstacle_weight: The same at a touch of an obstacle.
+        obstacle_range: Its distance [m].
+        first_share: Share of both weights that counts in the first segment.
+        growth: Share of the run after which they count in full.
         final_agents: Numbers of agents in the evaluation at the end.
         final_bounds: Their d_bar.
+        final_presets: Their presets.
+
+    Raises:
+        ValueError: A value is out of range.
     """
 
     task: ClassVar[str] = "spacecraft"
-    positive: ClassVar[tuple[str, ...]] = ("time_limit", "nearness_range")
+    positive: ClassVar[tuple[str, ...]] = (
+        "time_limit",
+        "nearness_range",
+        "obstacle_range",
+        "first_share",
+        "growth",
+    )
     counts: ClassVar[tuple[str, ...]] = (*Training.counts, "agents")
     algorithm: Algorithm = field(
         default_factory=lambda: Ppo(
-            rollout_steps=128, batch_size=4608, epochs=5, learning_rate=7e-4
+            rollout_steps=128,
+            batch_size=4608,
+            epochs=5,
+            learning_rate=7e-4,
+            discount=0.995,
+            initial_log_std=-1.5,
         )
     )
-    segments: int = 10
+    segments: int = 20
     segment_steps: int = 2560
     worlds: int = 24
-    effort_weight: float = 0.02
+    effort_weight: float = 0.05
     disturbance_bound: float = 0.4
     curve_episodes: int = 20
     final_episodes: int = 200
-    preset: str = "open"
+    preset: str = "paper"
     agents: int = 6
     time_limit: float = 20.0
-    nearness_weight: float = 5.0
-    nearness_range: float = 0.5
-    final_agents: tuple[int, ...] = (3, 6)
+    progress_weight: float = 1.5
+    goal_weight: float = 0.5
+    nearness_weight: float = 12.0
+    nearness_range: float = 0.25
+    obstacle_weight: float = 12.0
+    obstacle_range: float = 0.15
+    first_share: float = 0.4
+    growth: float = 0.6
+    final_agents: tuple[int, ...] = (6,)
     final_bounds: tuple[float, ...] = (0.4,)
+    final_presets: tuple[str, ...] = ("paper", "open")
 
     @property
     def rows(self) -> int:

@@ -30,76 +30,109 @@ from lagros_envs.seeding import episode_seeds
 from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
 from lagros_policies.sensed import Sensed
-from lagros_policies.spacecraft_ppo import FEATURES, SpacecraftPpoPolicy, body_features
+from lagros_policies.spacecraft_ppo import (
+    FEATURES,
+    WRENCH,
+    SpacecraftPpoPolicy,
+    look,
+    thrust_of,
+)
 
+FloatArray = NDArray[np.float64]
 RATES = ("success", "strict_success", "paper_success", "collided")
 
 
-class KeepDistance(VecEnvWrapper):
-    """Makes nearness to other agents cost, so that avoidance is learnt before collisions teach it.
+class ShapedReward(VecEnvWrapper):
+    """Makes it cost to be near to other bodies, and pay to be at the goal.
 
-    The penalty of the environment comes once, at the first collision; this comes at every step, and
-    to those that have collided already, which no observation tells apart.
+    The penalty and the bonus of the environment come once, at the first collision and at the first
+    success; these come at every step, also to those that have collided already, which no
+    observation tells apart. A body that is near costs w (1 - gap / reach)^2 per second, w from a
+    touch on.
 
     Args:
         venv: The environment, with the plain observation of the spacecraft.
         layout: Of that observation.
-        touch: Distance of two centres at a touch [m].
-        weight: Cost per second at a touch.
-        reach: Distance beyond touching at which it has fallen to nothing [m].
+        training: Its weights and reaches.
         period: Control period [s].
+        goal_radius: Distance from the goal at which an agent has arrived [m].
+        agent_radius: Of every agent [m].
+
+    Attributes:
+        share: Of the cost of being near that counts now.
     """
 
     def __init__(
         self,
         venv: VecEnv,
         layout: Layout,
-        touch: float,
-        weight: float,
-        reach: float,
+        training: SpacecraftTraining,
         period: float,
+        goal_radius: float,
+        agent_radius: float,
     ) -> None:
         """Wrap the environment; see the class."""
         super().__init__(venv)
-        self.layout, self.touch, self.reach = layout, touch, reach
-        self.cost_of_step = weight * period
+        self.layout, self.training, self.period = layout, training, period
+        self.goal_radius, self.agent_radius = goal_radius, agent_radius
+        self.share = 1.0
 
     def reset(self) -> NDArray[np.float32]:
         """Start an episode in every world."""
         return np.asarray(self.venv.reset())
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Take the step; rewards are lower where agents are close to each other."""
+        """Take the step; rewards are lower near others and higher at the goal."""
         observation, reward, done, infos = self.venv.step_wait()
         seen = np.array(observation)
         for row in np.flatnonzero(done):
             # What the step led to; the observation is of the next episode.
             seen[row] = infos[row]["terminal_observation"]
-        sensed = Sensed.of(self.layout, seen)
-        gaps = np.linalg.norm(sensed.neighbours[..., :2], axis=-1) - self.touch
-        nearness = np.clip(1.0 - gaps / self.reach, 0.0, 1.0)
-        cost = np.sum(nearness * sensed.neighbour_mask, axis=1)
-        lowered = reward - self.cost_of_step * cost
-        return observation, lowered.astype(np.float32), done, infos
+        sensed, run = Sensed.of(self.layout, seen), self.training
+        others = np.linalg.norm(sensed.neighbours[..., :2], axis=-1) - 2.0 * self.agent_radius
+        walls = np.linalg.norm(sensed.obstacles[..., :2], axis=-1)
+        walls = walls - sensed.obstacles[..., 2] - self.agent_radius
+        cost = run.nearness_weight * _nearness(others, sensed.neighbour_mask, run.nearness_range)
+        cost += run.obstacle_weight * _nearness(walls, sensed.obstacle_mask, run.obstacle_range)
+        arrived = np.linalg.norm(sensed.goal, axis=1) <= self.goal_radius
+        shaped = reward + self.period * (run.goal_weight * arrived - self.share * cost)
+        return observation, shaped.astype(np.float32), done, infos
 
 
-class BodyFeatures(VecEnvWrapper):
-    """Shows the agent `body_features` of the observation.
+def _nearness(gaps: FloatArray, mask: NDArray[np.bool_], reach: float) -> FloatArray:
+    """Return the sum of (1 - gap / reach)^2 over the bodies that are sensed, shape (rows,)."""
+    squares = np.clip(1.0 - gaps / reach, 0.0, 1.0) ** 2
+    total: FloatArray = np.sum(squares * mask, axis=1)
+    return total
+
+
+class GoalFrame(VecEnvWrapper):
+    """Shows the agent `look` of the observation and lets it act in the same frame.
+
+    Its action has three numbers within -1 and 1; `thrust_of` makes eight thrusts of them.
 
     Args:
         venv: The environment, with the plain observation of the spacecraft.
         layout: Of that observation.
+        settings: The task.
     """
 
-    def __init__(self, venv: VecEnv, layout: Layout) -> None:
+    def __init__(self, venv: VecEnv, layout: Layout, settings: SpacecraftSettings) -> None:
         """Wrap the environment; see the class."""
-        space = spaces.Box(-np.inf, np.inf, (FEATURES,), np.float32)
-        super().__init__(venv, observation_space=space)
-        self.layout = layout
+        super().__init__(
+            venv,
+            observation_space=spaces.Box(-np.inf, np.inf, (FEATURES,), np.float32),
+            action_space=spaces.Box(-1.0, 1.0, (WRENCH,), np.float32),
+        )
+        self.layout, self.settings = layout, settings
 
     def reset(self) -> NDArray[np.float32]:
-        """Start an episode in every world and return the features (rows, 27)."""
-        return body_features(self.layout, np.asarray(self.venv.reset()))
+        """Start an episode in every world and return the features (rows, 53)."""
+        return self._look(np.asarray(self.venv.reset()))
+
+    def step_async(self, actions: NDArray[np.floating]) -> None:
+        """Store the thrusts of the coming step, from actions (rows, 3)."""
+        self.venv.step_async(thrust_of(self.settings, self._axes, actions))
 
     def step_wait(self) -> VecEnvStepReturn:
         """Take the step and map the observations, those of ended episodes included."""
@@ -107,9 +140,14 @@ class BodyFeatures(VecEnvWrapper):
         rows = np.flatnonzero(done)
         if rows.size:
             last = np.stack([infos[row]["terminal_observation"] for row in rows])
-            for row, features in zip(rows, body_features(self.layout, last), strict=True):
+            for row, features in zip(rows, look(self.layout, last).features, strict=True):
                 infos[row]["terminal_observation"] = features
-        return body_features(self.layout, np.asarray(observation)), reward, done, infos
+        return self._look(np.asarray(observation)), reward, done, infos
+
+    def _look(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        seen = look(self.layout, observation)
+        self._axes = seen.axes
+        return seen.features
 
 
 class SpacecraftLesson:
@@ -121,67 +159,82 @@ class SpacecraftLesson:
 
     Attributes:
         venv: The worlds as the agents meet them.
+        shaped: The reward in them.
     """
 
     def __init__(self, training: SpacecraftTraining, parallel_env: bool = False) -> None:
         """Build the worlds; see the class."""
         self.training = training
         settings = SpacecraftSettings(
-            time_limit=training.time_limit, effort_weight=training.effort_weight
+            time_limit=training.time_limit,
+            effort_weight=training.effort_weight,
+            progress_weight=training.progress_weight,
         )
         preset = preset_named(training.preset).for_agents(training.agents)
         layout = Layout.for_preset(preset, settings)
-        apart = KeepDistance(
+        self.shaped = ShapedReward(
             _rows(training, settings, parallel_env),
             layout,
-            2.0 * preset.agent_radius,
-            training.nearness_weight,
-            training.nearness_range,
+            training,
             settings.control_period,
+            settings.goal_radius,
+            preset.agent_radius,
         )
         # The features have fixed scales; only the returns are normalised.
         self.venv: VecEnv = VecNormalize(
-            BodyFeatures(apart, layout), norm_obs=False, gamma=training.algorithm.discount
+            GoalFrame(self.shaped, layout, settings),
+            norm_obs=False,
+            gamma=training.algorithm.discount,
         )
+
+    def begin(self, segment: int) -> None:
+        """Let the cost of being near grow: in full from the start, nobody would go anywhere."""
+        run = self.training
+        grown = min(1.0, segment / (run.growth * run.segments))
+        self.shaped.share = run.first_share + (1.0 - run.first_share) * grown
 
     def figures(self, model: BaseAlgorithm) -> dict[str, float]:
         """Return the figures of the agents on the held-out worlds of the learning curve."""
         run = self.training
         seeds = episode_seeds(0, run.curve_episodes, CURVE)
-        return summary(self._fly(model, run.agents, seeds, run.disturbance_bound))
+        return summary(self._fly(model, run.preset, run.agents, seeds, run.disturbance_bound))
 
     def final(self, model: BaseAlgorithm) -> list[dict[str, Any]]:
-        """Return the figures at the end, for each number of agents and bound."""
+        """Return the figures at the end, for each preset, number of agents and bound."""
         run = self.training
         seeds = episode_seeds(0, run.final_episodes, FINAL)
-        rows = []
-        for agents in run.final_agents:
-            for bound in run.final_bounds:
-                measures = self._fly(model, agents, seeds, bound)
-                successes = measures["success"].reshape(-1, agents).sum(axis=1)
-                interval = cluster_rate_interval(successes.tolist(), [agents] * len(seeds))
-                rows.append(
-                    {
-                        "agents": agents,
-                        "disturbance": run.disturbance,
-                        "bound": bound,
-                        "worlds": len(seeds),
-                        **rounded(summary(measures)),
-                        "success_ci95": [round(limit, 4) for limit in interval],
-                    }
-                )
-        return rows
+        return [
+            self._final_row(model, preset, agents, seeds, bound)
+            for preset in run.final_presets
+            for agents in run.final_agents
+            for bound in run.final_bounds
+        ]
+
+    def _final_row(
+        self, model: BaseAlgorithm, preset: str, agents: int, seeds: Sequence[int], bound: float
+    ) -> dict[str, Any]:
+        measures = self._fly(model, preset, agents, seeds, bound)
+        successes = measures["success"].reshape(-1, agents).sum(axis=1)
+        interval = cluster_rate_interval(successes.tolist(), [agents] * len(seeds))
+        return {
+            "preset": preset,
+            "agents": agents,
+            "disturbance": self.training.disturbance,
+            "bound": bound,
+            "worlds": len(seeds),
+            **rounded(summary(measures)),
+            "success_ci95": [round(limit, 4) for limit in interval],
+        }
 
     def save(self, model: BaseAlgorithm, path: Path) -> None:
         """Write the actor as safetensors."""
         actor_network(model).save(path)
 
     def _fly(
-        self, model: BaseAlgorithm, agents: int, seeds: Sequence[int], bound: float
+        self, model: BaseAlgorithm, preset: str, agents: int, seeds: Sequence[int], bound: float
     ) -> dict[str, NDArray[Any]]:
-        run = self.training
-        policy = SpacecraftPpoPolicy(SpacecraftSettings(), run.preset, agents, actor_network(model))
-        return evaluate(policy, run.preset, agents, seeds, run.disturbance, bound)
+        policy = SpacecraftPpoPolicy(SpacecraftSettings(), preset, agents, actor_network(model))
+        return evaluate(policy, preset, agents, seeds, self.training.disturbance, bound)
 
 
 def _rows(training: SpacecraftTraining, settings: SpacecraftSettings, parallel_env: bool) -> VecEnv:
