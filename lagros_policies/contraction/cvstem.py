@@ -43,12 +43,6 @@ from lagros_policies.contraction.semidefinite import (
 FloatArray = NDArray[np.float64]
 Verified = TypeVar("Verified", bound=ContractionMetric)
 
-# Their names before they had a module of their own; `proof.program` still imports these.
-_Problem = ConeProgram
-_block = cone_rows
-_svec = svec
-_symmetric_basis = symmetric_basis
-
 # Angles at which I <= W_bar(theta) <= chi I is imposed.
 _BOUND_ANGLES = 25
 _CHECK_ANGLES = 1001

@@ -41,7 +41,7 @@ from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.semidefinite import svec, symmetric_basis
-from lagros_policies.contraction.tube_design import PlanBox
+from lagros_policies.contraction.tube_design import PlanBox, self_contained
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -55,7 +55,6 @@ _FORCE = 10.0
 _ANGLES = 9
 _WORST = 30
 _ROUNDS = 40
-_ROOM = 1.01
 # W_0 exceeds W_N by this share, so that the proof of (**) has room for its rounding.
 _SLACK = 1e-4
 _ROUNDING = 1e-9
@@ -257,19 +256,10 @@ def design_held_contained(system: System, plan: PlanBox, design: HeldDesign) -> 
         InfeasibleError: The errors outgrow the box on which there is a tube.
         RuntimeError: The solver stopped, or the two did not meet.
     """
-    error = np.zeros(_STATES)
-    for _ in range(_ROUNDS):
-        try:
-            tube = design_held(system, plan, error, design)
-        except ValueError as problem:
-            raise InfeasibleError(
-                f"no contained tube for disturbance_bound={design.disturbance_bound} held for "
-                f"{design.period} s around {plan}: {problem}"
-            ) from problem
-        if tube.contained:
-            return tube
-        error = np.maximum(error, _ROOM * tube.steady_outputs)
-    raise RuntimeError(f"the errors still grow after {_ROUNDS} rounds for {design}")
+    return self_contained(
+        lambda error: design_held(system, plan, error, design),
+        f"disturbance_bound={design.disturbance_bound} held for {design.period} s around {plan}",
+    )
 
 
 def bernstein_rate(degree: int) -> list[dict[int, float]]:

@@ -20,8 +20,9 @@ and |c'e| <= sqrt(c'W c (1 - exp(-2 alpha t))): the ellipsoid V <= 1 is never le
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -245,6 +246,21 @@ def design_constant(
     return ConstantTube(design, dual, weight, plan, error)
 
 
+class TubeInBox(Protocol):
+    """A tube whose condition was imposed on a box."""
+
+    @property
+    def steady_outputs(self) -> FloatArray:
+        """Bound of each |e_i|, shape (4,)."""
+
+    @property
+    def contained(self) -> bool:
+        """Whether the tube keeps the state in that box."""
+
+
+Contained = TypeVar("Contained", bound=TubeInBox)
+
+
 def design_contained(system: System, plan: PlanBox, design: TubeDesign) -> ConstantTube:
     """Design a tube on the errors that it allows itself: from none, until both meet.
 
@@ -260,19 +276,37 @@ def design_contained(system: System, plan: PlanBox, design: TubeDesign) -> Const
         InfeasibleError: The errors outgrow the box on which there is a metric.
         RuntimeError: The solver stopped, or the two did not meet.
     """
+    return self_contained(
+        lambda error: design_constant(system, plan, error, design),
+        f"disturbance_bound={design.disturbance_bound} around {plan}",
+    )
+
+
+def self_contained(design_for: Callable[[FloatArray], Contained], what: str) -> Contained:
+    """Design a tube again and again, each time on the errors that the last one allows.
+
+    Args:
+        design_for: Gives the tube for errors (4,) up to which its condition is to hold; ValueError
+            (so InfeasibleError) where there is none.
+        what: What the tube is for, to be said where there is none.
+
+    Returns:
+        The first tube that is contained in the box of its condition.
+
+    Raises:
+        InfeasibleError: The errors outgrow the box on which there is a tube.
+        RuntimeError: The two did not meet.
+    """
     error = np.zeros(4)
     for _ in range(_ROUNDS):
         try:
-            tube = design_constant(system, plan, error, design)
+            tube = design_for(error)
         except ValueError as problem:
-            raise InfeasibleError(
-                f"no contained tube for disturbance_bound={design.disturbance_bound} around "
-                f"{plan}: {problem}"
-            ) from problem
+            raise InfeasibleError(f"no contained tube for {what}: {problem}") from problem
         if tube.contained:
             return tube
         error = np.maximum(error, _ROOM * tube.steady_outputs)
-    raise RuntimeError(f"the errors still grow after {_ROUNDS} rounds for {design}")
+    raise RuntimeError(f"the errors still grow after {_ROUNDS} rounds for {what}")
 
 
 def _samples(system: System, box: ProofBox) -> tuple[FloatArray, FloatArray]:

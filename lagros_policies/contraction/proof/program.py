@@ -18,18 +18,17 @@ from scipy import sparse
 
 from lagros_envs.dynamics import CartPole, control_matrix, jacobian, linearise_hold
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
-from lagros_policies.contraction.cvstem import (
-    CvStemSettings,
-    InfeasibleError,
-    _block,
-    _Problem,
-    _svec,
-    _symmetric_basis,
-)
+from lagros_policies.contraction.cvstem import CvStemSettings, InfeasibleError
 from lagros_policies.contraction.metric import Metric, Region, basis, basis_rate
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.proof.cartpole import PROVED_BOX
 from lagros_policies.contraction.proof.condition import prove_bounds
+from lagros_policies.contraction.semidefinite import (
+    ConeProgram,
+    cone_rows,
+    svec,
+    symmetric_basis,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -178,7 +177,7 @@ def _rate_blocks(
     system: CartPole, pool: Points, settings: ProvedDesignSettings, margin: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the condition's derivatives by W_i's entries (s, degree + 1, 10, 4, 4) and by nu."""
-    scale, symmetric = np.asarray(settings.cvstem.scaling), _symmetric_basis(4)
+    scale, symmetric = np.asarray(settings.cvstem.scaling), symmetric_basis(4)
     slope = jacobian(system, pool.other, pool.control)[0] * scale[:, None] / scale
     gain = control_matrix(system, pool.state) * scale[:, None]
     powers = basis(pool.state[:, ANGLE], settings.cvstem.degree)
@@ -195,7 +194,7 @@ def _held_blocks(
     system: CartPole, pool: Points, settings: ProvedDesignSettings, margin: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the same of the condition over a hold."""
-    scale, symmetric = np.asarray(settings.cvstem.scaling), _symmetric_basis(4)
+    scale, symmetric = np.asarray(settings.cvstem.scaling), symmetric_basis(4)
     following, slope, gain = linearise_hold(system, pool.state, pool.control, settings.period)
     slope, gain = slope * scale[:, None] / scale, gain * scale[:, None]
     before = basis(pool.state[:, ANGLE], settings.cvstem.degree)
@@ -222,7 +221,7 @@ def _solve(
     system: CartPole, pool: Points, held: Points, settings: ProvedDesignSettings
 ) -> tuple[Metric, float]:
     """Solve one program; return the metric, its bounds proved, and nu_h."""
-    cvstem, symmetric = settings.cvstem, _symmetric_basis(4)
+    cvstem, symmetric = settings.cvstem, symmetric_basis(4)
     reach = min(max(settings.box.angle, settings.leaning.angle) + _OVERSHOOT, 1.5)
     change = _chebyshev(cvstem.degree, reach)
     entries = (cvstem.degree + 1) * len(symmetric)
@@ -235,18 +234,18 @@ def _solve(
     by_rate, by_hold = (np.einsum("ji,siabc->sjabc", change, part) for part in (by_rate, by_hold))
     # Columns: W_bar, then nu, chi and nu_h.
     blocks = [
-        _spread_columns(_block(by_rate, by_nu, None), entries, (0, 1)),
-        _spread_columns(_block(by_hold, by_held_nu, None), entries, (2, 1)),
-        _spread_columns(_block(-spread, None, None), entries, (0, 1)),
-        _spread_columns(_block(spread, None, -unit), entries, (0, 1)),
+        _spread_columns(cone_rows(by_rate, by_nu, None), entries, (0, 1)),
+        _spread_columns(cone_rows(by_hold, by_held_nu, None), entries, (2, 1)),
+        _spread_columns(cone_rows(-spread, None, None), entries, (0, 1)),
+        _spread_columns(cone_rows(spread, None, -unit), entries, (0, 1)),
     ]
     rights = [np.zeros(len(block)) for block in blocks]
-    rights[2] = -_svec(unit).ravel()
+    rights[2] = -svec(unit).ravel()
     cost = np.zeros(columns)
     cost[-3:] = cvstem.control_penalty, 1.0, _HELD_PENALTY
     cones = len(pool.state) + len(held.state) + 2 * _BOUND_ANGLES
     rows = sparse.csc_matrix(np.vstack(blocks))
-    problem = _Problem(cost, rows, np.concatenate(rights), cones, 4, symmetric)
+    problem = ConeProgram(cost, rows, np.concatenate(rights), cones, 4, symmetric)
     values = _clarabel(problem, settings)
     found = values[:entries].reshape(cvstem.degree + 1, -1)
     scaled = np.einsum("ji,jk,kab->iab", change, found, symmetric)
@@ -316,7 +315,7 @@ def _chebyshev(degree: int, reach: float) -> FloatArray:
     return rows
 
 
-def _clarabel(problem: _Problem, settings: ProvedDesignSettings) -> FloatArray:
+def _clarabel(problem: ConeProgram, settings: ProvedDesignSettings) -> FloatArray:
     """Solve to a tolerance that the proofs make up for, and in fewer iterations."""
     import clarabel
 
