@@ -99,7 +99,18 @@ class Layout:
         )
 
 
-def observe(world: SpacecraftWorld, layout: Layout) -> Float32Array:
+def observation_columns(world: SpacecraftWorld, layout: Layout) -> Float32Array:
+    """Return room for the observations of all agents, one row for each entry.
+
+    Rows a multiple of a page apart would share their place in the cache.
+    """
+    rows = world.worlds * world.agents
+    return np.zeros((layout.size, rows + _APART), np.float32)[:, :rows]
+
+
+def observe(
+    world: SpacecraftWorld, layout: Layout, columns: Float32Array | None = None
+) -> Float32Array:
     """Return the observation of every agent.
 
     Another agent is sensed when its centre, and an obstacle when any part of it, is no further from
@@ -108,15 +119,15 @@ def observe(world: SpacecraftWorld, layout: Layout) -> Float32Array:
     Args:
         world: The worlds.
         layout: `Layout.of(world)`.
+        columns: What `observation_columns` returned for them, to be used again and again: fresh
+            memory costs as much as the observation.
 
     Returns:
-        Shape (worlds, agents, layout.size).
+        Shape (worlds, agents, layout.size), a new array.
     """
     worlds, agents, at = world.worlds, world.agents, layout.slices
-    rows = worlds * agents
-    # One column after the other, each over all agents of all worlds, and turned at the end. Columns
-    # a multiple of a page apart would share their place in the cache.
-    columns = np.zeros((layout.size, rows + _APART), np.float32)[:, :rows]
+    # One entry after the other, each over all agents of all worlds, and turned at the end.
+    columns = observation_columns(world, layout) if columns is None else columns
     parts = columns.reshape(-1, worlds, agents)
     x, y, heading, velocity_x, velocity_y, spin = world.parts
     np.subtract(world.goals[0], x, out=parts[0], casting="same_kind")
@@ -132,33 +143,31 @@ def observe(world: SpacecraftWorld, layout: Layout) -> Float32Array:
         seen = tuple(
             part.reshape(-1).take(places) - part for part in (x, y, velocity_x, velocity_y)
         )
-        _fill(parts[at["neighbours"]], parts[at["neighbour_mask"]], seen, _within(world, *seen[:2]))
+        sight = world.settings.sensing_radius**2
+        _fill(parts[at["neighbours"]], parts[at["neighbour_mask"]], seen, sight)
     if world.obstacles:
         across, up = world.centres_by_agent[0] - x, world.centres_by_agent[1] - y
-        radii = world.radii_by_agent
-        sizes = np.where(np.isfinite(radii), radii, 0.0)
-        near = _within(world, across, up, radii)
-        _fill(parts[at["obstacles"]], parts[at["obstacle_mask"]], (across, up, sizes), near)
+        seen = across, up, world.radii_by_agent
+        _fill(parts[at["obstacles"]], parts[at["obstacle_mask"]], seen, world.sight_by_agent)
     return np.ascontiguousarray(columns.T).reshape(worlds, agents, -1)
 
 
-def _within(
-    world: SpacecraftWorld, across: FloatArray, up: FloatArray, radii: FloatArray | None = None
-) -> NDArray[np.bool_]:
-    """Tell what is sensed, from its offset and, if it is an obstacle, its radius."""
-    reach = world.settings.sensing_radius
-    if radii is None:
-        return across * across + up * up <= reach**2
-    # -inf where there is no obstacle: its reach must not count.
-    reaches = np.maximum(radii + reach, -1.0)
-    return across * across + up * up <= reaches * np.abs(reaches)
-
-
 def _fill(
-    slots: Float32Array, mask: Float32Array, seen: tuple[FloatArray, ...], sensed: NDArray[np.bool_]
+    slots: Float32Array,
+    mask: Float32Array,
+    seen: tuple[FloatArray, ...],
+    sight: float | FloatArray,
 ) -> None:
-    """Write what is sensed, shapes (slots, worlds, agents), to its columns; zero what is not."""
-    mask[:] = sensed
+    """Write what is sensed, shapes (slots, worlds, agents), to its entries; zero what is not.
+
+    Args:
+        slots: The entries of the slots, one after the other.
+        mask: The entries of their masks.
+        seen: What may be sensed; the first two are its offset.
+        sight: Square of the distance up to which it is.
+    """
+    across, up = seen[:2]
+    mask[:] = across * across + up * up <= sight
     for index, values in enumerate(seen):
         np.multiply(values.astype(np.float32), mask, out=slots[index :: len(seen)])
 

@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
 from lagros_envs.autoreset import RestartingVectorEnv
-from lagros_envs.observation import global_state, named_state_space, observe
+from lagros_envs.observation import (
+    global_state,
+    named_state_space,
+    observation_columns,
+    observe,
+)
 from lagros_envs.scenarios import Preset, Scenario
 from lagros_envs.seeding import episode_streams
 from lagros_envs.spacecraft_episode import SpacecraftEpisode, action_space, scenario_from_options
@@ -85,6 +90,7 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
             compiled,
         )
         self.world, self.layout = self.episode.world, self.episode.layout
+        self._columns = observation_columns(self.world, self.layout)
         self.settings, self.preset = self.episode.settings, self.episode.preset
         self.named_space = self.layout.named_space
         self.named_state_space = named_state_space(
@@ -184,7 +190,7 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         self.world.begin(worlds, chosen, [stream.disturbance for stream in streams])
 
     def _observation(self) -> Float32Array:
-        return observe(self.world, self.layout).reshape(self.num_envs, -1)
+        return observe(self.world, self.layout, self._columns).reshape(self.num_envs, -1)
 
     def _info(self) -> dict[str, Any]:
         return {

@@ -79,7 +79,12 @@ class SpacecraftWorld:
         self.obstacle_radii = np.full((worlds, obstacles), -np.inf)
         # The same for every agent, obstacles first: operations on them run over all rows at once.
         self.centres_by_agent = np.zeros((2, obstacles, *shape))
-        self.radii_by_agent = np.full((obstacles, *shape), -np.inf)
+        # Zero where there is none.
+        self.radii_by_agent = np.zeros((obstacles, *shape))
+        # Distance of centres at which an agent touches, and its square within which it senses;
+        # negative where there is no obstacle.
+        self.contact_by_agent = np.full((obstacles, *shape), -np.inf)
+        self.sight_by_agent = np.full((obstacles, *shape), -1.0)
         self.agent_radius = np.zeros(worlds)
         self.core_radius = np.zeros(worlds)
         self.scenarios: list[Scenario | None] = [None] * worlds
@@ -148,10 +153,9 @@ class SpacecraftWorld:
             self.obstacle_centres[:, world, :count] = scenario.obstacles.T
             self.obstacle_radii[world] = -np.inf
             self.obstacle_radii[world, :count] = scenario.obstacle_radii
-            self.centres_by_agent[:, :, world] = self.obstacle_centres[:, world, :, None]
-            self.radii_by_agent[:, world] = self.obstacle_radii[world, :, None]
             self.agent_radius[world] = scenario.agent_radius
             self.core_radius[world] = scenario.core
+            self._place_obstacles(world)
             self.scenarios[world] = scenario
             for agent, stream in enumerate(generator.spawn(self.agents)):
                 self._pushes[world, :, :, agent] = self.disturbance.realise(
@@ -194,9 +198,7 @@ class SpacecraftWorld:
         self.effort += effort
         self.step_count = self.step_count + going
         hit = swept_agents(path, 2.0 * self.agent_radius)
-        # The distance of centres at which agent and obstacle touch.
-        contact = self.radii_by_agent + self.core_radius[:, None]
-        hit |= swept_obstacles(path, self.centres_by_agent, contact)
+        hit |= swept_obstacles(path, self.centres_by_agent, self.contact_by_agent)
         hit |= ~integrated
         hit &= going[:, None]
         first_collision = hit & ~self.collided
@@ -261,6 +263,16 @@ class SpacecraftWorld:
                 f"most {self.obstacles}: build it with preset=dataclasses.replace(PRESETS[...], "
                 f"obstacle_count=(0, {len(scenario.obstacles)}))"
             )
+
+    def _place_obstacles(self, world: int) -> None:
+        """Write the obstacles of a world once for every agent."""
+        centres, radii = self.obstacle_centres[:, world], self.obstacle_radii[world]
+        # -inf where there is no obstacle: its reach must not count.
+        reach = np.maximum(radii + self.settings.sensing_radius, -1.0)
+        self.centres_by_agent[:, :, world] = centres[..., None]
+        self.radii_by_agent[:, world] = np.where(np.isfinite(radii), radii, 0.0)[:, None]
+        self.contact_by_agent[:, world] = (radii + self.core_radius[world])[:, None]
+        self.sight_by_agent[:, world] = (reach * np.abs(reach))[:, None]
 
     def _current_push(self) -> FloatArray:
         """Return d of this step, a new array (6, worlds, agents)."""
