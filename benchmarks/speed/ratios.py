@@ -348,7 +348,7 @@ def _processes(scale: Scale) -> Duel:
             policies=("tube-mpc", "lagros"),
             episodes=4 * scale.tracked_episodes,
             jobs=jobs,
-            chunk=max(1, scale.tracked_episodes // 2),
+            chunk=max(1, scale.tracked_episodes // 5),
             timing_episodes=1,
         )
         return lambda _: run_benchmark(settings) and None
