@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
 from lagros_envs.observation import Layout
-from lagros_envs.scenarios import Preset, preset_named
+from lagros_envs.scenarios import Preset
 from lagros_policies.contraction.thrusters import allocate
 from lagros_policies.imitation.networks import Mlp
 from lagros_policies.policy import PolicyState
 from lagros_policies.sensed import Sensed
+from lagros_policies.spacecraft_setup import task_and_preset
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -182,8 +183,8 @@ class SpacecraftPpoPolicy:
         weights: Path | str | Mlp | None = None,
     ) -> None:
         """Load the actor."""
-        self.settings = settings or task.SpacecraftSettings()
-        self.layout = Layout.for_preset(preset_named(preset).for_agents(num_agents), self.settings)
+        self.settings, chosen = task_and_preset(settings, preset, num_agents)
+        self.layout = Layout.for_preset(chosen, self.settings)
         if not isinstance(weights, Mlp):
             weights = Mlp.load(WEIGHTS if weights is None else weights)
         self.network = weights

@@ -10,13 +10,13 @@ import hashlib
 import math
 import os
 import sys
-from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from numpy.polynomial import Chebyshev, Polynomial
 from numpy.typing import NDArray
 
 from lagros_envs.dynamics.straight_line import (
@@ -255,39 +255,15 @@ def _reduce(x: Recorded) -> tuple[Any, Any]:
 def _economised(powers: range) -> list[float]:
     """Return the coefficients of sine or cosine at these powers, for angles up to pi/2.
 
-    The Taylor series, twice as long, loses its last term again and again, as a multiple of the
-    Chebyshev polynomial of that degree: of all ways to lower the degree by one the one that errs
-    least (economisation, Lanczos 1956).
+    The Taylor series in the square of the angle, twice as long as need be, is written in
+    Chebyshev's polynomials and cut there, where it costs least (economisation, Lanczos 1956).
     """
     longer = range(powers.start, powers.stop + 2 * len(powers), 2)
-    series = [Fraction((-1) ** (power // 2), math.factorial(power)) for power in longer]
-    reach = Fraction(math.pi / 2) ** 2
-    while len(series) > len(powers):
-        chebyshev = _chebyshev(len(series) - 1, reach)
-        share = series[-1] / chebyshev[-1]
-        series = [
-            one - share * other for one, other in zip(series[:-1], chebyshev[:-1], strict=True)
-        ]
-    return [float(coefficient) for coefficient in series]
-
-
-def _chebyshev(degree: int, reach: Fraction) -> list[Fraction]:
-    """Return the coefficients of the Chebyshev polynomial of a degree, for numbers in [0, reach].
-
-    With z = 2 y / reach - 1: T_0 = 1, T_1 = z, T_(n + 1) = 2 z T_n - T_(n - 1).
-    """
-    scale = 2 / reach
-    before, last = [Fraction(1)], [Fraction(-1), scale]
-    if degree == 0:
-        return before
-    for _ in range(degree - 1):
-        longer = [-2 * one for one in last] + [Fraction(0)]
-        for k, one in enumerate(last):
-            longer[k + 1] += 2 * scale * one
-        for k, one in enumerate(before):
-            longer[k] -= one
-        before, last = last, longer
-    return last
+    series = Polynomial([(-1) ** (power // 2) / math.factorial(power) for power in longer])
+    in_chebyshev = series.convert(domain=[0.0, (math.pi / 2) ** 2], kind=Chebyshev)
+    return cast(
+        list[float], in_chebyshev.truncate(len(powers)).convert(kind=Polynomial).coef.tolist()
+    )
 
 
 def _polynomial(x: Any, coefficients: list[float]) -> Any:

@@ -491,3 +491,22 @@ def test_worst_says_that_an_autoreset_has_no_nominal():
         ended = bool(terminated[0] or truncated[0])
     with pytest.raises(ValueError, match="autoreset_mode"):
         env.step(still)
+
+
+def test_whoever_goes_on_past_the_time_limit_still_has_the_tube():
+    """Every world, alone or among others, at any time and each at its own."""
+    envs = gym.make_vec("lagros/CartPole-v0", num_envs=2, autoreset_mode="disabled")
+    env = gym.make("lagros/CartPole-v0").unwrapped
+    start = {"initial_state": np.zeros((2, 4)), "goal": np.zeros(2)}
+    envs.reset(seed=0, options=start)
+    env.reset(seed=0, options={name: value[0] for name, value in start.items()})
+    tube, period = env.settings.tube, env.settings.control_period
+    for step in range(1, 95):
+        if step == 10:
+            envs.reset(options={**start, "reset_mask": np.array([False, True])})
+        _, _, _, truncated, info = envs.step(np.zeros((2, 1), np.float32))
+        times = period * np.array([step, step if step < 10 else step - 9])
+        np.testing.assert_allclose(info["tube_radius"], tube.radius(times), rtol=1e-12)
+        np.testing.assert_array_equal(truncated, times > 9.0 - 1e-9)
+        _, _, _, _, alone = env.step(np.zeros(1, np.float32))
+        assert alone["tube_radius"] == pytest.approx(tube.radius(float(times[0])), rel=1e-12)
