@@ -37,13 +37,17 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         metric: As in `CartPoleEnv`.
         settings: As in `CartPoleEnv`.
         compiled: Whether numba (the extra "fast") compiles the equation of motion, which makes a
-            step several times faster. States then differ from those of NumPy in the last digits.
+            step eight times faster; None: where it is installed. Compiled states differ from those
+            of NumPy in the last digits (1e-15 a step).
         autoreset_mode: As in `autoreset.RestartingVectorEnv`.
         render_mode: Must be None; render a single environment instead.
 
+    Attributes:
+        compiled: Whether the equation of motion is compiled.
+
     Raises:
         ValueError: A setting is not valid.
-        ImportError: `compiled` was asked for and numba is not installed.
+        ImportError: `compiled=True` and numba is not installed.
     """
 
     def __init__(
@@ -54,7 +58,7 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         disturbance_channels: Literal["all", "rates"] | Sequence[bool] = "all",
         metric: Any = None,
         settings: task.CartPoleSettings | None = None,
-        compiled: bool = False,
+        compiled: bool | None = None,
         autoreset_mode: Literal["next_step", "same_step", "disabled"] | AutoresetMode = "next_step",
         render_mode: str | None = None,
     ) -> None:
@@ -86,6 +90,7 @@ class CartPoleVectorEnv(RestartingVectorEnv):
             measure=task.StepMeasure(self.settings),
             given=task.STATE_DIM,
         )
+        self.compiled = self._hold.compiled
         self._allocate()
 
     def _allocate(self) -> None:

@@ -34,7 +34,7 @@ class SpacecraftEpisode:
         metric: As in `SpacecraftParallelEnv`.
         settings: The task.
         worlds: Number of worlds.
-        compiled: Whether numba compiles the equation of motion.
+        compiled: As in `SpacecraftWorld`.
 
     Raises:
         ValueError: A setting is not valid.
@@ -50,7 +50,7 @@ class SpacecraftEpisode:
         metric: Any,
         settings: task.SpacecraftSettings | None,
         worlds: int = 1,
-        compiled: bool = False,
+        compiled: bool | None = False,
     ) -> None:
         """Build the worlds."""
         self.settings = settings or task.SpacecraftSettings()

@@ -51,8 +51,12 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         autoreset_mode: As in `autoreset.RestartingVectorEnv`.
         render_mode: Must be None; render a single environment instead.
 
+    Attributes:
+        compiled: Whether the equation of motion is compiled.
+
     Raises:
         ValueError: A setting is not valid.
+        ImportError: `compiled=True` and numba is not installed.
     """
 
     def __init__(
@@ -65,7 +69,7 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         disturbance_channels: Literal["all", "rates"] | Sequence[bool] = "all",
         metric: Any = None,
         settings: task.SpacecraftSettings | None = None,
-        compiled: bool = False,
+        compiled: bool | None = None,
         autoreset_mode: Literal["next_step", "same_step", "disabled"] | AutoresetMode = "next_step",
         render_mode: str | None = None,
     ) -> None:
@@ -90,6 +94,7 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
             compiled,
         )
         self.world, self.layout = self.episode.world, self.episode.layout
+        self.compiled = self.world.compiled
         self._columns = observation_columns(self.world, self.layout)
         self.settings, self.preset = self.episode.settings, self.episode.preset
         self.named_space = self.layout.named_space

@@ -54,6 +54,9 @@ class SpacecraftWorld:
         disturbance: The disturbance; every agent has its own realisation.
         settings: The task.
         compiled: Whether numba compiles the equation of motion, see `dynamics.held.HeldBatch`.
+
+    Attributes:
+        compiled: Whether it is compiled.
     """
 
     def __init__(
@@ -63,7 +66,7 @@ class SpacecraftWorld:
         obstacles: int,
         disturbance: Disturbance,
         settings: task.SpacecraftSettings,
-        compiled: bool = False,
+        compiled: bool | None = False,
     ) -> None:
         """Allocate the worlds; `begin` starts them."""
         self.worlds, self.agents, self.obstacles = worlds, agents, obstacles
@@ -71,6 +74,7 @@ class SpacecraftWorld:
         shape = (worlds, agents)
         substep = settings.control_period / SUBSTEPS
         self._hold = HeldBatch(settings.system.by_wrench, substep, shape, compiled, 1)
+        self.compiled = self._hold.compiled
         self.parts = np.zeros((task.STATE_DIM, *shape))
         self.goals = np.zeros((2, *shape))
         self.start_headings = np.zeros(shape)

@@ -183,7 +183,13 @@ def spacecraft_scores(
 
     def worlds(number: int) -> SpacecraftVectorEnv:
         return SpacecraftVectorEnv(
-            number * agents, agents, preset, kind, bound, autoreset_mode="disabled"
+            number * agents,
+            agents,
+            preset,
+            kind,
+            bound,
+            compiled=False,
+            autoreset_mode="disabled",
         )
 
     policy: Any = make("centralized", worlds(1))

@@ -124,6 +124,8 @@ class SpacecraftExperiment:
             case.condition.kind,
             case.condition.bound,
             "all" if self.settings.channels == "all" else "rates",
+            # The figures must not depend on whether numba is installed.
+            compiled=False,
             autoreset_mode="disabled",
         )
 

@@ -118,7 +118,13 @@ def study(worlds: int, bounds: list[float], rates: list[float]) -> list[dict[str
     rows = []
     for bound in bounds:
         env = SpacecraftVectorEnv(
-            worlds * AGENTS, AGENTS, "paper", "uniform", bound, autoreset_mode="disabled"
+            worlds * AGENTS,
+            AGENTS,
+            "paper",
+            "uniform",
+            bound,
+            compiled=False,
+            autoreset_mode="disabled",
         )
         policy = CentralizedPolicy(env.settings, "paper", AGENTS, disturbance_bound=bound)
         plans: list[CentralizedState] | None = None

@@ -119,6 +119,7 @@ def fly(
         "uniform",
         bound,
         settings=SETTINGS,
+        compiled=False,
         autoreset_mode="disabled",
     )
     observation, info = env.reset(seed=seeds)

@@ -39,7 +39,13 @@ STUDY = 4242  # namespace of the worlds of this study
 def fly(weights: Path, bound: float, worlds: int, filtered: bool) -> dict[str, Any]:
     """Fly one network in all worlds side by side and return its figures."""
     env = SpacecraftVectorEnv(
-        worlds * AGENTS, AGENTS, "paper", "uniform", bound, autoreset_mode="disabled"
+        worlds * AGENTS,
+        AGENTS,
+        "paper",
+        "uniform",
+        bound,
+        compiled=False,
+        autoreset_mode="disabled",
     )
     policy: Any = SpacecraftNetworkPolicy(env.settings, env.preset, weights=weights)
     if filtered:

@@ -175,6 +175,7 @@ def spacecraft_study(worlds: int) -> list[dict[str, Any]]:
         "paper",
         "uniform",
         _SPACECRAFT_BOUND,
+        compiled=False,
         autoreset_mode="disabled",
     )
     lagros = SpacecraftLagrosPolicy(env.settings, env.preset)

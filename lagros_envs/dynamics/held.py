@@ -73,12 +73,13 @@ class HeldBatch:
         system: The system.
         duration: Length of the step [s].
         shape: Shape of the batch.
-        compiled: Whether numba compiles it.
+        compiled: Whether numba compiles it; None: where it is installed.
         substeps: Runge-Kutta steps in the step.
         measure: Computes more from the state at the end, see `straight_line.recorded_hold`.
         given: Number of arrays that the measure is given.
 
     Attributes:
+        compiled: Whether it is compiled.
         measured: What the measure computed in the last call, shape (measured, *shape).
 
     Raises:
@@ -90,7 +91,7 @@ class HeldBatch:
         system: System,
         duration: float,
         shape: tuple[int, ...],
-        compiled: bool = False,
+        compiled: bool | None = False,
         substeps: int = SUBSTEPS,
         measure: Measure | None = None,
         given: int = 0,
@@ -100,7 +101,8 @@ class HeldBatch:
         n, m = system.state_dim, system.control_dim
         self._ends = n, n + m, n + m + n
         self._run: Callable[[], Any]
-        if compiled:
+        self.compiled = has_numba() if compiled is None else compiled
+        if self.compiled:
             from lagros_envs.dynamics.compiled import CompiledBatch
 
             batch = CompiledBatch(system, duration, shape, substeps, measure, given)
@@ -151,6 +153,16 @@ class HeldBatch:
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what the step is made from, not its buffers."""
         return HeldBatch, self._made_from
+
+
+@lru_cache(maxsize=1)
+def has_numba() -> bool:
+    """Return whether numba can be imported: it refuses versions of NumPy that it does not know."""
+    try:
+        import numba  # noqa: F401
+    except ImportError:
+        return False
+    return True
 
 
 @lru_cache(maxsize=32)

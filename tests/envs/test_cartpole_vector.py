@@ -92,14 +92,15 @@ def test_make_vec_gives_the_vectorised_class():
     assert envs.action_space.shape == (3, 1)
 
 
+@pytest.mark.parametrize("compiled", [False, None], ids=["plain", "as-it-comes"])
 @pytest.mark.parametrize("change", KINDS)
-def test_each_world_is_the_single_environment(change, mixed):
+def test_each_world_is_the_single_environment(change, compiled, mixed):
     """Observations, rewards, ends, infos and states, until the end of each world's episode."""
     change = {"disturbance_bound": 0.6, **change}
     nominals = 0.2 * np.cumsum(
         np.random.default_rng(5).standard_normal((WORLDS, 91, 4)) * 0.1, axis=1
     )
-    envs = vector(autoreset_mode="disabled", **change).unwrapped
+    envs = vector(autoreset_mode="disabled", compiled=compiled, **change).unwrapped
     observations, infos = envs.reset(seed=SEEDS, options={"nominal": nominals})
     singles = [CartPoleEnv(**change) for _ in SEEDS]
     for world, (env, seed) in enumerate(zip(singles, SEEDS, strict=True)):

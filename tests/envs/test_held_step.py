@@ -13,7 +13,7 @@ import pytest
 import lagros_envs  # noqa: F401 - registers the ids
 from lagros_envs import cartpole_task as task
 from lagros_envs.dynamics import CartPole, Spacecraft, compiled, hold_step
-from lagros_envs.dynamics.held import HeldBatch, HeldStep
+from lagros_envs.dynamics.held import HeldBatch, HeldStep, has_numba
 from lagros_envs.dynamics.integrate import rk4_hold
 from lagros_envs.dynamics.straight_line import ArrayFunction, straight_line
 
@@ -185,6 +185,35 @@ def test_a_missing_numba_is_named(monkeypatch):
     compiled.compiled_function.cache_clear()
     with pytest.raises(ImportError, match=r"lagros\[fast\]"):
         HeldBatch(CartPole(), 0.1, (2,), compiled=True)
+
+
+VECTORS = {
+    "lagros/CartPole-v0": {"num_envs": 2},
+    "lagros/Spacecraft-v0": {"num_envs": 4, "num_agents": 2, "preset": "open"},
+}
+
+
+@needs_numba
+@pytest.mark.parametrize("name", VECTORS)
+def test_many_worlds_are_compiled_where_numba_is_installed(name):
+    assert gym.make_vec(name, **VECTORS[name]).unwrapped.compiled is True
+    assert gym.make_vec(name, **VECTORS[name], compiled=False).unwrapped.compiled is False
+
+
+@pytest.mark.parametrize("name", VECTORS)
+def test_many_worlds_do_without_numba(name, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "numba", None)
+    has_numba.cache_clear()
+    compiled.compiled_function.cache_clear()
+    try:
+        envs = gym.make_vec(name, **VECTORS[name])
+        assert envs.unwrapped.compiled is False
+        envs.reset(seed=0)
+        envs.step(envs.action_space.sample())
+        with pytest.raises(ImportError, match=r"lagros\[fast\]"):
+            gym.make_vec(name, **VECTORS[name], compiled=True)
+    finally:
+        has_numba.cache_clear()
 
 
 @needs_numba

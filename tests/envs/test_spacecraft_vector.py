@@ -39,10 +39,11 @@ def test_make_vec_gives_rows_for_agents():
     assert plain.single_observation_space == single.observation_space
 
 
+@pytest.mark.parametrize("compiled", [False, None], ids=["plain", "as-it-comes"])
 @pytest.mark.parametrize("agents", [1, 3])
-def test_each_world_is_the_parallel_environment(agents):
+def test_each_world_is_the_parallel_environment(agents, compiled):
     seeds = [11, 0, 2**62, 7]
-    envs = vector(4, agents, disturbance="uniform", autoreset_mode="disabled")
+    envs = vector(4, agents, disturbance="uniform", autoreset_mode="disabled", compiled=compiled)
     observations, infos = envs.reset(seed=seeds)
     singles = [spacecraft_v0.parallel_env(num_agents=agents, disturbance="uniform") for _ in seeds]
     results = [env.reset(seed=seed) for env, seed in zip(singles, seeds, strict=True)]

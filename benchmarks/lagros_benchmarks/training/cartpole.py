@@ -98,6 +98,8 @@ class CartPoleLesson:
             disturbance=training.disturbance,
             disturbance_bound=training.disturbance_bound,
             settings=settings,
+            # The weights must not depend on whether numba is installed.
+            compiled=False,
             autoreset_mode="same_step",
         )
         venv: VecEnv = SB3VectorEnv(worlds)
@@ -218,6 +220,7 @@ def evaluate(policy: Any, seeds: list[int], disturbance: str, bound: float) -> d
         disturbance=disturbance,
         disturbance_bound=bound,
         settings=policy.settings,
+        compiled=False,
         autoreset_mode="disabled",
     )
     observation, info = venv.reset(seed=seeds)

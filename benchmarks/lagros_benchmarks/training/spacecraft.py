@@ -250,7 +250,9 @@ def _rows(training: SpacecraftTraining, settings: SpacecraftSettings, parallel_e
             [spacecraft_v0.parallel_env(agents, **task) for _ in range(training.worlds)]
         )
     return SB3VectorEnv(
-        SpacecraftVectorEnv(training.rows, agents, autoreset_mode="same_step", **task)
+        SpacecraftVectorEnv(
+            training.rows, agents, compiled=False, autoreset_mode="same_step", **task
+        )
     )
 
 
@@ -282,6 +284,7 @@ def evaluate(
         disturbance,
         bound,
         settings=policy.settings,
+        compiled=False,
         autoreset_mode="disabled",
     )
     observation, info = env.reset(seed=list(seeds))

@@ -172,6 +172,7 @@ class SpacecraftTarget:
             self.preset,
             disturbance,
             self.bound,
+            compiled=False,
             autoreset_mode="disabled",
         )
 
