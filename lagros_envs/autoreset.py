@@ -18,6 +18,7 @@ from lagros_envs.disturbances import Disturbance
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
+FloatArray = NDArray[np.float64]
 
 MODES = {
     "next_step": AutoresetMode.NEXT_STEP,
@@ -37,6 +38,26 @@ def autoreset_mode_named(mode: str | AutoresetMode) -> AutoresetMode:
     if mode not in MODES:
         raise ValueError(f"autoreset_mode={mode!r} must be one of {', '.join(MODES)}")
     return MODES[mode]
+
+
+def nominal_after(
+    kept: FloatArray | None, starting: BoolArray, given: FloatArray | None
+) -> FloatArray | None:
+    """Return the nominal trajectories of all worlds after some have started an episode.
+
+    Args:
+        kept: Those of the episodes so far, the worlds first; None if no world has one.
+        starting: Which worlds have started.
+        given: What the new episodes are to follow, for all worlds; None for nothing.
+
+    Returns:
+        A new array, nan for a world without a nominal, or None if there is nothing to keep or give.
+    """
+    if given is None and kept is None:
+        return None
+    new = np.full_like(cast(FloatArray, kept), np.nan) if given is None else given
+    old = np.full_like(new, np.nan) if kept is None else kept
+    return np.where(starting.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 class RestartingVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, Any]):

@@ -170,9 +170,18 @@ def _finite(name: str, value: Any, *shapes: tuple[int, ...]) -> FloatArray:
 
 
 def nominal_from_options(
-    options: dict[str, Any], settings: CartPoleSettings, batch: tuple[int, ...] = ()
+    options: dict[str, Any],
+    settings: CartPoleSettings,
+    batch: tuple[int, ...] = (),
+    looked_at: NDArray[np.bool_] | None = None,
 ) -> FloatArray | None:
     """Return x_d at every control instant, shape (*batch, steps + 1, 4), if the options hold it.
+
+    Args:
+        options: As given to reset.
+        settings: The task.
+        batch: Leading axes.
+        looked_at: Which of a leading axis have to be finite; all of them if left out.
 
     Raises:
         ValueError: The trajectory has the wrong shape or is not finite.
@@ -182,7 +191,9 @@ def nominal_from_options(
         return None
     nominal = np.array(value, dtype=np.float64)
     wanted = (*batch, settings.steps + 1, STATE_DIM)
-    if nominal.shape != wanted or not np.all(np.isfinite(nominal)):
+    if nominal.shape != wanted or not np.all(
+        np.isfinite(nominal[... if looked_at is None else looked_at])
+    ):
         raise ValueError(
             f"options['nominal'] has shape {nominal.shape}; it must be finite and of shape "
             f"{wanted}, the nominal state at every control instant"

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
-from lagros_envs.autoreset import RestartingVectorEnv
+from lagros_envs.autoreset import RestartingVectorEnv, nominal_after
 from lagros_envs.disturbances import Disturbance, Situation, channel_mask
 from lagros_envs.dynamics.held import HeldBatch
 from lagros_envs.seeding import seeded_streams
@@ -163,20 +163,16 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         return np.ascontiguousarray(self._state.T)
 
     def _set_nominal(self, mask: BoolArray, options: dict[str, Any]) -> None:
-        nominal = task.nominal_from_options(options, self.settings, (self.num_envs,))
-        if mask.all() or self.nominal is None:
-            self.nominal = nominal
-        elif nominal is not None:
-            self.nominal = np.where(mask[:, None, None], nominal, self.nominal)
-        if self.disturbance.kind == "worst" and self.nominal is None:
+        given = task.nominal_from_options(options, self.settings, (self.num_envs,), mask)
+        if self.disturbance.kind == "worst" and given is None:
             raise ValueError(
                 'disturbance="worst" needs the nominal trajectories: pass '
                 'reset(options={"nominal": array of shape (num_envs, steps + 1, 4)})'
             )
+        self.nominal = nominal_after(None if mask.all() else self.nominal, mask, given)
 
     def _forget_nominal(self, mask: BoolArray) -> None:
-        if self.nominal is not None:
-            self.nominal = np.where(mask[:, None, None], np.nan, self.nominal)
+        self.nominal = nominal_after(self.nominal, mask, None)
 
     def _start(self, worlds: IntArray, seeds: Sequence[int], options: dict[str, Any]) -> None:
         settings = self.settings

@@ -138,7 +138,10 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[np.floating
 
 
 def nominal_from_options(
-    options: dict[str, Any], settings: SpacecraftSettings, batch: tuple[int, ...]
+    options: dict[str, Any],
+    settings: SpacecraftSettings,
+    batch: tuple[int, ...],
+    looked_at: NDArray[np.bool_] | None = None,
 ) -> FloatArray | None:
     """Return x_d of every agent at every control instant, if the options hold it.
 
@@ -146,6 +149,7 @@ def nominal_from_options(
         options: As given to reset.
         settings: The task.
         batch: Leading axes, then the number of agents.
+        looked_at: Which of a leading axis have to be finite; all of them if left out.
 
     Returns:
         Shape (*leading, steps + 1, agents, 6), or None.
@@ -159,7 +163,9 @@ def nominal_from_options(
     nominal = np.array(value, dtype=np.float64)
     *leading, agents = batch
     wanted = (*leading, settings.steps + 1, agents, STATE_DIM)
-    if nominal.shape != wanted or not np.all(np.isfinite(nominal)):
+    if nominal.shape != wanted or not np.all(
+        np.isfinite(nominal[... if looked_at is None else looked_at])
+    ):
         raise ValueError(
             f"options['nominal'] has shape {nominal.shape}; it must be finite and of shape "
             f"{wanted}, the nominal state of every agent at every control instant"

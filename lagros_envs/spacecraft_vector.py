@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
-from lagros_envs.autoreset import RestartingVectorEnv
+from lagros_envs.autoreset import RestartingVectorEnv, nominal_after
 from lagros_envs.observation import (
     global_state,
     named_state_space,
@@ -171,19 +171,15 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         return [scenario_from_options({"scenario": scenario}) for scenario in given]
 
     def _set_nominal(self, mask: BoolArray, options: dict[str, Any]) -> None:
-        nominal = task.nominal_from_options(
-            options, self.settings, (self.num_worlds, self.num_agents)
+        given = task.nominal_from_options(
+            options, self.settings, (self.num_worlds, self.num_agents), mask
         )
-        world = self.world
-        if mask.all() or world.nominal is None:
-            self.episode.need_nominal(nominal)
-            world.nominal = nominal
-        elif nominal is not None:
-            world.nominal = np.where(mask[:, None, None, None], nominal, world.nominal)
+        self.episode.need_nominal(given)
+        kept = None if mask.all() else self.world.nominal
+        self.world.nominal = nominal_after(kept, mask, given)
 
     def _forget_nominal(self, mask: BoolArray) -> None:
-        if self.world.nominal is not None:
-            self.world.nominal[mask] = np.nan
+        self.world.nominal = nominal_after(self.world.nominal, mask, None)
 
     def _start(self, worlds: IntArray, seeds: Sequence[int], options: dict[str, Any]) -> None:
         given = self._scenarios(options)

@@ -337,12 +337,40 @@ def test_a_masked_reset_leaves_the_other_worlds_alone(hold):
     close(envs.state[3], single.state)
 
 
+def test_a_masked_reset_takes_nothing_for_the_other_worlds():
+    envs = vector(3, autoreset_mode="disabled").unwrapped
+    envs.reset(seed=0)
+    mask = np.array([True, False, False])
+    nominal = np.ones((3, 91, 4))
+    nominal[~mask] = np.nan
+    _, info = envs.reset(options={"reset_mask": mask, "nominal": nominal})
+    np.testing.assert_array_equal(np.isnan(info["tracking_error"]), ~mask)
+    nominal[~mask] = 5.0
+    _, info = envs.reset(options={"reset_mask": mask, "nominal": nominal})
+    np.testing.assert_array_equal(np.isnan(info["tracking_error"]), ~mask)
+    nominal[mask, 4] = np.inf
+    with pytest.raises(ValueError, match="must be finite"):
+        envs.reset(options={"reset_mask": mask, "nominal": nominal})
+
+
+def test_the_worst_push_needs_a_nominal_for_every_new_episode():
+    envs = vector(2, disturbance="worst", metric=METRIC, autoreset_mode="disabled").unwrapped
+    envs.reset(seed=0, options={"nominal": np.zeros((2, 91, 4))})
+    with pytest.raises(ValueError, match="nominal"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
+
+
 def test_a_masked_reset_keeps_the_nominals_of_the_other_worlds():
     envs = vector(3, autoreset_mode="disabled").unwrapped
     envs.reset(seed=0, options={"nominal": np.ones((3, 91, 4))})
     mask = np.array([True, False, False])
     envs.reset(options={"reset_mask": mask, "nominal": np.full((3, 91, 4), 2.0)})
     np.testing.assert_array_equal(envs.nominal[:, 0, 0], [2.0, 1.0, 1.0])
+    # Nobody has planned the new episode of the second world.
+    mask = np.array([False, True, False])
+    _, info = envs.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(envs.nominal[:, 0, 0], [2.0, np.nan, 1.0])
+    np.testing.assert_array_equal(np.isnan(info["tracking_error"]), mask)
     envs.reset(seed=0)
     assert envs.nominal is None
 

@@ -210,6 +210,13 @@ def test_a_nominal_of_an_ended_episode_is_not_used_for_the_next():
     assert not nominal.any()
 
 
+def test_a_masked_reset_without_a_nominal_forgets_that_of_the_episode_before():
+    envs = vector(2, 2, disturbance="uniform", settings=SHORT, autoreset_mode="disabled")
+    envs.reset(seed=0, options={"nominal": np.zeros((2, 11, 2, 6))})
+    _, info = envs.reset(options={"reset_mask": np.array([True, False])})
+    np.testing.assert_array_equal(np.isnan(info["tracking_error"]), [True, True, False, False])
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
