@@ -6,7 +6,6 @@ Only the standard library, typer and `terminal` are imported here; the command i
 from __future__ import annotations
 
 import json as json_module
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -49,7 +48,13 @@ def certify(
         int | None,
         typer.Option(help="Episodes (worlds) flown; cartpole 400, spacecraft 20; 0 for none."),
     ] = None,
-    seconds: Annotated[float, typer.Option(help="Time for each search for a proof [s].")] = 60.0,
+    seconds: Annotated[float, typer.Option(help="Time for each search for a proof, in s.")] = 60.0,
+    largest: Annotated[
+        bool,
+        typer.Option(
+            "--largest", help="Cart-pole: claim the largest multiple of the region that is proved."
+        ),
+    ] = False,
 ) -> None:
     """Print one certificate: region, α, χ, tube, and which kind each claim is.
 
@@ -71,14 +76,16 @@ def certify(
             raise ValueError(f"--episodes: {episodes!r} must be at least 0")
         if not seconds > 0.0:
             raise ValueError(f"--seconds: {seconds!r} must be positive")
+        if largest and task != "cartpole":
+            raise ValueError("--largest: the spacecraft's proof is for all states already")
     except ValueError as error:
         fail(error)
     level = BOUNDS[task] if bound is None else bound
-    certified: Callable[..., Certificate] = (
-        certify_cartpole if task == "cartpole" else certify_spacecraft
-    )
     try:
-        found = certified(metric, policy, level, episodes, seconds)
+        if task == "cartpole":
+            found = certify_cartpole(metric, policy, level, episodes, seconds, largest)
+        else:
+            found = certify_spacecraft(metric, policy, level, episodes, seconds)
     except FileNotFoundError as error:
         fail(f"--metric: there is no file {error.filename}", status=1)
     except (ValueError, OSError, RuntimeError) as error:
@@ -101,6 +108,7 @@ def certify_cartpole(
     bound: float = BOUNDS["cartpole"],
     episodes: int | None = None,
     seconds: float = 60.0,
+    largest: bool = False,
 ) -> Certificate:
     """Return the cart-pole's certificate.
 
@@ -110,14 +118,15 @@ def certify_cartpole(
         bound: d_bar, in units of the state per second.
         episodes: Episodes of each kind of disturbance; 400 if None, 0 for none.
         seconds: Time for each search for a proof [s].
+        largest: Whether the largest multiple of the region is claimed on which all can be proved.
 
     Raises:
         ValueError: The file is no metric.
         FileNotFoundError: There is no such file.
     """
     from lagros_benchmarks import certify_evidence as evidence
+    from lagros_benchmarks.certify_box import largest_proofs, load_cartpole_metric
     from lagros_envs.cartpole_task import CartPoleSettings
-    from lagros_policies.contraction import load_metric
     from lagros_policies.contraction.certificate_cartpole import (
         CartPoleQuestion,
         cartpole_certificate,
@@ -125,8 +134,12 @@ def certify_cartpole(
 
     task = CartPoleSettings()
     file, large = evidence.metric_to_prove(metric_file)
-    metric = load_metric(file)
-    box, proofs = evidence.cartpole_proofs(metric, seconds, large)
+    metric = load_cartpole_metric(file)
+    box, proofs = (
+        largest_proofs(metric, seconds)
+        if largest
+        else evidence.cartpole_proofs(metric, seconds, large)
+    )
     learned = policy == "lagros"
     error = evidence.recorded_error("cartpole", policy) if learned else 0.0
     lines = [evidence.recorded_statement("cartpole", policy, "N")] if learned else []
@@ -152,9 +165,9 @@ def certify_cartpole(
     # Nothing is held against a metric that is none.
     if flights is None or found.tube.certified is None:
         return found.with_evidence(lines)
-    line, largest = evidence.tube_line(found, flights, policy, bound)
+    line, widest = evidence.tube_line(found, flights, policy, bound)
     calibrated = evidence.calibrated_cartpole(policy, bound, count) if count >= _LEAST else []
-    return found.with_evidence([*lines, line, *calibrated], largest)
+    return found.with_evidence([*lines, line, *calibrated], widest)
 
 
 def certify_spacecraft(
@@ -224,6 +237,8 @@ def _numbers(found: Certificate) -> Table:
     from rich.table import Table
     from rich.text import Text
 
+    from lagros_policies.contraction.statement import at_most
+
     table = Table(show_header=False, box=None, padding=(0, 1))
     table.add_column(no_wrap=True)
     table.add_column()
@@ -234,15 +249,15 @@ def _numbers(found: Certificate) -> Table:
     rows = {
         "region": region,
         "α [1/s]": f"{found.alpha:.6g}",
-        "χ": f"{found.chi:.6g}",
+        "χ": at_most(found.chi, 6),
         "ν": f"{found.nu:.6g}",
-        "b̄": f"{found.b_bar:.6g}",
+        "b̄": at_most(found.b_bar, 6),
         "ε_ℓ": f"{found.epsilon_l:.6g} (observed)",
         "d̄": f"{found.d_bar:g}",
         "tube, paper": f"{tube.paper:g} (the success threshold; no bound)",
         "tube, certified": "none"
         if tube.certified is None
-        else f"{tube.certified:.4g} ({_CHANNELS[found.channels]})",
+        else f"{at_most(tube.certified)} ({_CHANNELS[found.channels]})",
         "tube, observed": "not flown" if tube.observed is None else f"{tube.observed:.4g}",
         "W̄(x)": f"{len(found.coefficients)} coefficients of {found.basis}",
     }

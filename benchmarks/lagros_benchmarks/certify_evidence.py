@@ -97,7 +97,7 @@ def load_axis_metric(path: Path | None, rate: float, period: float) -> AxisMetri
             raise ValueError(f"format {record['format']!r} is not {AXIS_FORMAT!r}")
         names = ("rate", "stiffness", "period")
         return AxisMetric(**{name: float(record[name]) for name in names})
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
         raise ValueError(f"{path} is not a metric of the spacecraft's axes: {error}") from error
 
 
@@ -354,19 +354,9 @@ def cartpole_proofs(
     Returns:
         The box of x, x_d and u_d, and the statements, or None if they are still to be made.
     """
-    from lagros_policies.contraction.proof.cartpole import prove_cartpole
-    from lagros_policies.contraction.proof.program import ProvedDesignSettings
+    from lagros_benchmarks.certify_box import merged, prove_multiple
 
     if not large:
         return SMALL_BOX, None
-    wanted = ProvedDesignSettings()
-    first = prove_cartpole(metric, wanted.box, most_seconds=most_seconds)
-    second = prove_cartpole(
-        metric,
-        wanted.leaning,
-        held_box=wanted.leaning,
-        period=wanted.period,
-        most_seconds=most_seconds,
-    )
-    lines = {line.text: line for line in (*first.statements, *second.statements)}
-    return wanted.box, list(lines.values())
+    box, first, second = prove_multiple(metric, 1.0, most_seconds)
+    return box, merged(first, second)

@@ -180,7 +180,10 @@ def markdown(rows: list[dict[str, Any]], certificate: dict[str, Any]) -> str:
         "",
         f"d̄ = {_BOUND:g}, α = {certificate['alpha']:.4g} 1/s, χ = {certificate['chi']:.4g}, b̄ = "
         f"{certificate['b_bar']:.4g}, L_f = {certificate['lipschitz']:.4g} 1/s on the region of "
-        f"the certificate, while x stays there; disturbances of {channels} in Theorem 1.",
+        f"the certificate, while x stays there; disturbances of {channels} in Theorem 1. "
+        "L_f is that of a u_d which does not answer to x, as a plan does not; a network's does, "
+        "which adds ‖B ∂u_d/∂x‖ to it: the bound of Lemma 1 is the paper's formula there, and no "
+        "proof.",
     ]
     return "\n".join(lines) + "\n"
 

@@ -72,7 +72,11 @@ def resting_plans(count: int) -> Plans:
 
 
 def fly(
-    tube: AnyTube, plans: Plans, which: IntArray, pushes: FloatArray | None
+    tube: AnyTube,
+    plans: Plans,
+    which: IntArray,
+    pushes: FloatArray | None,
+    flight: _AtWill | _Held | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Fly episodes from e(0) = 0 under the control of a tube.
 
@@ -81,12 +85,14 @@ def fly(
         plans: The plans.
         which: Plan of each flight, shape (b,).
         pushes: d / d_bar, shape (b, steps, 4); None for the d that raises V fastest.
+        flight: How the control is applied; as the tube asks for it if None.
 
     Returns:
         The largest |e_i| of each flight, (b, 4), and the largest share of the tube, max of
         sqrt(V(t) / bound of V(t)), (b,).
     """
-    flight = _Held(tube) if isinstance(tube, HeldTube) else _AtWill(tube)
+    if flight is None:
+        flight = _Held(tube) if isinstance(tube, HeldTube) else _AtWill(tube)
     bound, fine = tube.design.disturbance_bound, PERIOD / _FINE
     nominal = plans.start[which]
     state = nominal.copy()
@@ -106,6 +112,20 @@ def fly(
         allowed = float(tube.share((instant + 1) * fine)) ** 2
         share = np.maximum(share, np.sqrt(flight.energy(error) / allowed))
     return largest, share
+
+
+def steepest_share(tube: ConstantTube, plans: Plans, flights: int, hold: float | None) -> float:
+    """Return the largest sqrt(V / bound) under the d that raises V fastest.
+
+    Args:
+        tube: A tube for a control at will.
+        plans: The plans that are flown.
+        flights: Flights, from first pushes of their own.
+        hold: Time for which the control is held all the same [s]; None for a control at will.
+    """
+    which = np.arange(flights) % len(plans.start)
+    flight = None if hold is None else _Renewed(tube, round(hold * _FINE / PERIOD))
+    return float(fly(tube, plans, which, None, flight)[1].max())
 
 
 class _AtWill:
@@ -146,6 +166,29 @@ class _AtWill:
         return following[0], following[1]
 
 
+class _Renewed(_AtWill):
+    """The control at will, held for some Runge-Kutta steps all the same."""
+
+    def __init__(self, tube: ConstantTube, steps: int) -> None:
+        super().__init__(tube)
+        self._system = task.CartPoleSettings().system
+        self._steps, self._since = steps, 0
+        self._force: FloatArray = np.zeros((1, 1))
+
+    def renew(self, state: FloatArray, nominal: FloatArray, u_d: FloatArray) -> None:
+        """Take the control where a hold has ended."""
+        if self._since % self._steps == 0:
+            self._force = self._law(state, nominal, u_d)
+        self._since += 1
+
+    def advance(
+        self, state: FloatArray, nominal: FloatArray, u_d: FloatArray, push: FloatArray, time: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Integrate x under the force that is held and x_d under u_d."""
+        after = hold_step(self._system, state, self._force, time, push, 1)
+        return after, hold_step(self._system, nominal, u_d, time, substeps=1)
+
+
 class _Held:
     """A control that is held; for random parts of the hold where the tube covers that."""
 
@@ -168,7 +211,7 @@ class _Held:
     def slope(self, error: FloatArray) -> FloatArray:
         """Return a positive multiple of dV/de, (b, 4)."""
         inverse = np.linalg.inv(self._tube.dual_at(self._since / self._whole))
-        return np.concatenate([error, self._deviation], axis=-1) @ inverse[:, :4]
+        return np.asarray(np.concatenate([error, self._deviation], axis=-1) @ inverse[:, :4])
 
     def energy(self, error: FloatArray) -> FloatArray:
         """Return V before the control is renewed, (b,)."""

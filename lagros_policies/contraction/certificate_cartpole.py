@@ -29,7 +29,7 @@ from lagros_policies.contraction.proof.condition import (
     prove_bounds,
     prove_contraction,
 )
-from lagros_policies.contraction.statement import Statement
+from lagros_policies.contraction.statement import Statement, at_most
 from lagros_policies.contraction.theorems import (
     disturbed_rate,
     feasibility_residual,
@@ -43,6 +43,8 @@ FloatArray = NDArray[np.float64]
 
 # States at which the feasibility of u* is checked besides its proof.
 _CHECKS = 10_000
+# Above the rounding of a few products and roots, relative.
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -90,12 +92,15 @@ def cartpole_certificate(
         system: The cart-pole.
         metric: The metric.
         question: What is asked.
-        proofs: Statements that the condition holds on the box; proved here if None.
+        proofs: Statements of what was proved, first of all (14) on the box; proved here if None,
+            and taken as proved elsewhere if there are none.
         tubes: Tubes of constant metrics to prove as well.
         held: Tubes of a held control, likewise.
     """
     watch = Stopwatch()
     lines = list(_contraction(system, metric, question) if proofs is None else proofs)
+    # Without (14) nothing follows from it.
+    contracts = all(line.holds for line in lines[:1])
     watch.lap()
     box = question.box
     plain = replace(metric, scaling=np.ones(system.state_dim))
@@ -107,8 +112,8 @@ def cartpole_certificate(
         return _broken(metric, question, (*lines, failed))
     lines.append(
         Statement(
-            f"I <= W_bar <= {bounds.condition:.6g} I and ||B|| <= {bounds.control_gain:.6g} for "
-            f"every |theta| <= {box.angle:g} rad",
+            f"I <= W_bar <= {at_most(bounds.condition, 6)} I and ||B|| <= "
+            f"{at_most(bounds.control_gain, 6)} for every |theta| <= {box.angle:g} rad",
             "proved",
             True,
             watch.lap(),
@@ -124,7 +129,10 @@ def cartpole_certificate(
         question.error,
         bounds.control_gain,
     )
-    lines.append(_theorem_one(tube, question, drift, rate, alpha, watch.lap()))
+    radius = tube.steady_radius * (1.0 + _ROUNDING)
+    if contracts and math.isfinite(radius):
+        text = _theorem_one(tube, question, drift, rate, alpha)
+        lines.append(Statement(text, "proved", True, watch.lap()))
     lines.extend(_theorem_two(system, metric, box))
     lemma, lipschitz = _lemma(system, question, bounds)
     lines.append(lemma)
@@ -145,13 +153,13 @@ def cartpole_certificate(
         channels=channels,
         basis=basis_of(metric),
         coefficients=metric.coefficients / bounds.least,
-        tube=TubeSizes(question.paper_radius, tube.steady_radius),
+        tube=TubeSizes(question.paper_radius, radius if contracts else None),
         statements=tuple(lines),
         details={
             "drift": drift,
             "disturbed_rate": rate,
             "lipschitz": lipschitz,
-            "control_error": question.error,
+            "control_error": question.control_error,
             "largest_disturbance_of_the_angle": 2.0 * alpha / drift if drift > 0.0 else None,
             "tubes": [tube_record(constant) for constant in tubes],
             "held_tubes": [held_record(tube) for tube in held],
@@ -229,8 +237,8 @@ def tube_statement(tube: ConstantTube, proved: bool, seconds: float) -> Statemen
     plan, bound = tube.plan, tube.design.disturbance_bound
     return Statement(
         f"{tube.design.method} tube, all disturbances up to {bound:g}, control at will, e(0) = 0: "
-        f"|theta - theta_d| <= {angle:.4g} rad, |p - p_d| <= {p:.4g} m, ||e|| <= "
-        f"{tube.steady_radius:.4g}; it keeps the state in its box while |theta_d| <= "
+        f"|theta - theta_d| <= {at_most(angle)} rad, |p - p_d| <= {at_most(p)} m, ||e|| <= "
+        f"{at_most(tube.steady_radius)}; it keeps the state in its box while |theta_d| <= "
         f"{plan.angle:g} rad, |p_d'| <= {plan.velocity:g} m/s, |theta_d'| <= "
         f"{plan.angular_rate:g} rad/s and |u_d| <= {plan.force:g} N",
         "proved",
@@ -256,26 +264,27 @@ def _contraction(
 
 
 def _theorem_one(
-    tube: Tube, question: CartPoleQuestion, drift: float, rate: float, alpha: float, seconds: float
-) -> Statement:
+    tube: Tube, question: CartPoleQuestion, drift: float, rate: float, alpha: float
+) -> str:
     bound = question.disturbance_bound
     if rate > 0.0:
         what = (
             f"all disturbances up to {bound:g}, rate alpha - kappa d_bar / 2 = {rate:.4g} 1/s for "
-            f"their part in dM/dt (kappa = {drift:.4g})"
+            f"their part in dM/dt (kappa = {at_most(drift)})"
         )
     else:
         what = (
             f"disturbances up to {bound:g} of the two rates only (of all four states "
-            f"d_bar < {2.0 * alpha / drift:.3g} would be needed: kappa = {drift:.4g})"
+            f"d_bar < {2.0 * alpha / drift:.3g} would be needed: kappa = {at_most(drift)})"
         )
-    return Statement(
-        f"Theorem 1, control at will, while x stays in the region: ||e(t)|| <= "
-        f"{tube.steady_radius:.4g} (1 - exp(-{tube.contraction_rate:.4g} t)) for {what}, and "
-        f"a control within {question.error:.4g} N of one that contracts in this metric",
-        "proved",
-        math.isfinite(tube.steady_radius),
-        seconds,
+    known = ""
+    if question.control_error is None and question.learning_error > 0.0:
+        known = " (how far it is from that was not flown; taken is the recorded ||u_L - u*||)"
+    return (
+        f"Theorem 1, control at will, e(0) = 0, while x stays in the region: ||e(t)|| <= "
+        f"{at_most(tube.steady_radius)} (1 - exp(-{at_most(tube.contraction_rate)} t)) for {what}, "
+        f"and a control within {at_most(question.error)} N of one that contracts in this metric"
+        f"{known}"
     )
 
 
@@ -310,9 +319,9 @@ def _lemma(
         bounds.control_gain,
     )
     line = Statement(
-        f"Lemma 1, while x stays in the region: L_f <= {found.upper:.4g} 1/s for a u_d that does "
-        f"not answer to x; without feedback ||e|| is bounded by {at[0]:.3g}, {at[1]:.3g} and "
-        f"{at[2]:.3g} after 0.5, 1 and 2 s only",
+        f"Lemma 1, e(0) = 0, while x stays in the region: L_f <= {at_most(found.upper)} 1/s for a "
+        f"u_d that does not answer to x; without feedback ||e|| is bounded by "
+        f"{', '.join(at_most(bound, 3) for bound in at)} after 0.5, 1 and 2 s only",
         "proved",
         found.upper >= found.lower,
         found.seconds,

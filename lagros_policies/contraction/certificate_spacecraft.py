@@ -24,7 +24,7 @@ from lagros_policies.contraction.proof.spacecraft import (
     prove_axis,
     prove_spacecraft,
 )
-from lagros_policies.contraction.statement import Statement
+from lagros_policies.contraction.statement import Statement, at_most
 from lagros_policies.contraction.tube import diverging_bound
 
 FloatArray = NDArray[np.float64]
@@ -77,6 +77,7 @@ def spacecraft_certificate(
     statements = prove_spacecraft(plane, turning, body)
     watch.lap()
     tube = state_tube(plane, disturbance_bound + learning_error)
+    radius = tube.steady_radius * (1.0 + 2.0 * _ROUNDING)
     position = position_tube(plane, disturbance_bound + learning_error)
     pushed = max(1.0, push)
     return Certificate(
@@ -92,7 +93,7 @@ def spacecraft_certificate(
         channels="all",
         basis="1 (W_bar is constant); the state is [x, y, heading, vx, vy, spin]",
         coefficients=dual[None] / least,
-        tube=TubeSizes(paper_radius, tube.steady_radius * (1.0 + 2.0 * _ROUNDING)),
+        tube=TubeSizes(paper_radius, radius),
         statements=(
             *statements,
             Statement(
@@ -102,7 +103,7 @@ def spacecraft_certificate(
                 weight > 0.0,
                 watch.lap(),
             ),
-            *_tubes(plane, disturbance_bound, learning_error, tube.steady_radius),
+            *_tubes(plane, disturbance_bound, learning_error, radius),
             _lemma(pushed, disturbance_bound, learning_error),
         ),
         details={
@@ -111,6 +112,7 @@ def spacecraft_certificate(
                 "position_held_without_learning_error": certified_margin(plane, disturbance_bound),
             },
             "lipschitz": pushed,
+            "ellipsoid": _ellipsoid_record(plane.period),
         },
     )
 
@@ -164,29 +166,30 @@ def _tubes(
     plane: AxisMetric, bound: float, learning_error: float, radius: float
 ) -> list[Statement]:
     watch = Stopwatch()
-    reach = position_tube(plane, bound + learning_error).steady_radius
+    reach = position_tube(plane, bound + learning_error).steady_radius * (1.0 + 2.0 * _ROUNDING)
     first = Statement(
         f"Theorem 1, control at will: ||e|| of the plane's four states tends to at most "
-        f"{radius:.4g}, its position error to {reach:.4g} m, for d_bar = {bound:g} and "
-        f"||u_L - u*|| <= {learning_error:.4g} m/s^2",
+        f"{at_most(radius)}, its position error to {at_most(reach)} m, for d_bar = {bound:g} and "
+        f"||u_L - u*|| <= {at_most(learning_error)} m/s^2",
         "proved",
         prove_axis(plane).holds,
         watch.lap(),
     )
     margin = certified_margin(plane, bound)
     second = Statement(
-        f"u* held for {plane.period:g} s, without learning error: the position error never exceeds "
-        f"{margin:.4g} m under d_bar = {bound:g}, at and between the instants (of a wrench that "
-        "keeps its direction while the body turns)",
+        f"u* held for {plane.period:g} s, without learning error, e(0) = 0: the position error "
+        f"never exceeds {at_most(margin)} m under d_bar = {bound:g}, at and between the instants "
+        "(of a wrench that keeps its direction while the body turns)",
         "proved",
         prove_axis(plane).holds,
         watch.lap(),
     )
     ellipsoid = design_axis_ellipsoid(plane.period, "state")
+    widest = at_most(ellipsoid.position * bound * (1.0 + _ROUNDING))
     third = Statement(
         f"invariant ellipsoid, v = K e held for {plane.period:g} s with K = "
-        f"{ellipsoid.gain.round(4).tolist()}, without learning error: the position error never "
-        f"exceeds {ellipsoid.position * bound:.4g} m under d_bar = {bound:g} (likewise)",
+        f"{ellipsoid.gain.round(4).tolist()} (rounded), without learning error, e(0) = 0: the "
+        f"position error never exceeds {widest} m under d_bar = {bound:g} (likewise)",
         "proved",
         prove_axis_ellipsoid(ellipsoid),
         watch.lap(),
@@ -194,12 +197,25 @@ def _tubes(
     return [first, second, third]
 
 
+def _ellipsoid_record(period: float) -> dict[str, object]:
+    """Return the ellipsoid as what JSON can hold; `position` is per unit of d_bar."""
+    found = design_axis_ellipsoid(period, "state")
+    return {
+        "W": found.dual.tolist(),
+        "K": found.gain.tolist(),
+        "tau": found.share,
+        "hold": found.period,
+        "position": found.position * (1.0 + _ROUNDING),
+    }
+
+
 def _lemma(lipschitz: float, bound: float, learning_error: float) -> Statement:
     watch = Stopwatch()
     at = diverging_bound(np.array([1.0, 10.0]), lipschitz, bound + learning_error)
     return Statement(
-        f"Lemma 1: L_f <= {lipschitz:.4g} 1/s for all states, so that without feedback ||e|| is "
-        f"bounded by {at[0]:.3g} after 1 s and by {at[1]:.3g} after 10 s only",
+        f"Lemma 1, e(0) = 0: L_f <= {at_most(lipschitz)} 1/s for all states, so that without "
+        f"feedback ||e|| is bounded by {at_most(at[0], 3)} after 1 s and by {at_most(at[1], 3)} "
+        "after 10 s only",
         "proved",
         True,
         watch.lap(),

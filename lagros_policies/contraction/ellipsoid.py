@@ -21,7 +21,7 @@ from lagros_policies.contraction.metric import Metric, Region
 from lagros_policies.contraction.proof.cells import Examined, Search, search
 from lagros_policies.contraction.proof.intervals import Interval, exact, negative_definite
 from lagros_policies.contraction.proof.rates import RateCondition, Violation, rate_condition
-from lagros_policies.contraction.tube_design import ConstantTube
+from lagros_policies.contraction.tube_design import ConstantTube, TubeDesign
 
 FloatArray = NDArray[np.float64]
 
@@ -37,10 +37,10 @@ class SourceCondition:
 
     Args:
         condition: The condition without it.
-        source: The multiple.
+        source: An enclosure of the multiple, of no dimension.
     """
 
-    def __init__(self, condition: RateCondition, source: float) -> None:
+    def __init__(self, condition: RateCondition, source: Interval) -> None:
         """Keep both."""
         self.condition, self.source = condition, source
 
@@ -52,7 +52,7 @@ class SourceCondition:
         """Enclose the matrices over cells (k, 3)."""
         found = self.condition.examine(cells)
         eye = np.eye(found.corners.shape[-1])
-        return replace(found, corners=found.corners + exact(self.source * eye))
+        return replace(found, corners=found.corners + self.source * eye)
 
     def failure(self, cells: Interval) -> Violation | None:
         """Return a point at which the condition fails even without the source, or None."""
@@ -115,8 +115,10 @@ def prove_tube(system: CartPole, tube: ConstantTube, most_seconds: float = 60.0)
         The proof.
     """
     start = time.monotonic()
+    if not tube.least_eigenvalue > 0.0:
+        return TubeProof(tube, Search(False, 0, 0.0), False, time.monotonic() - start)
     condition = rate_condition(system, as_metric(tube), tube.proof_box, tube.design.rate)
-    pushed = SourceCondition(condition, tube.design.source)
+    pushed = SourceCondition(condition, _source(tube.design))
     found = search(pushed, _BATCH, _MOST_CELLS, most_seconds)
     eye = np.eye(len(tube.dual))
     definite = bool(negative_definite(tube.least_eigenvalue * eye - exact(tube.dual)))
@@ -170,3 +172,10 @@ class TubeControl:
         gain = np.where(acts, phi_0 / np.where(size > _TINY, size, 1.0), 0.0)
         control: FloatArray = nominal_control - gain[..., None] * phi_1
         return control
+
+
+def _source(design: TubeDesign) -> Interval:
+    """Enclose what the disturbance adds, w_bar^2 / (2 alpha) for the ellipsoid and else nothing."""
+    if design.method != "ellipsoid":
+        return exact(0.0)
+    return exact(design.disturbance_bound).square() / (exact(design.rate) * 2.0)

@@ -20,11 +20,13 @@ from lagros_policies.contraction.proof.intervals import (
 )
 from lagros_policies.contraction.proof.lifted import LiftedCondition
 from lagros_policies.contraction.proof.rates import Violation
-from lagros_policies.contraction.statement import Statement
+from lagros_policies.contraction.statement import Statement, at_most
 
 FloatArray = NDArray[np.float64]
 
 _STATES = 4
+# The shortest hold that is covered, as a share of the longest, where shorter ones are.
+SHORTEST = 1e-6
 # Cells of one pass, and of a whole search.
 _BATCH = 100
 _MOST_CELLS = 100_000
@@ -61,8 +63,9 @@ def prove_held_tube(system: CartPole, tube: HeldTube, most_seconds: float = 60.0
 
     What is proved: for every target trajectory in `tube.plan`, from e(0) = 0, under every
     disturbance (with what a learning error adds) of norm at most w_bar, which may change within a
-    hold, and under u = u_d + K e(t_k) held for h (for at most h with `aperiodic`), |c'e(t)| <=
-    tube.output_radius(c, t) at every time t. It is a statement on the exact motion.
+    hold, and under u = u_d + K e(t_k) held for h (with `aperiodic` for any times from a millionth
+    of h to h), |c'e(t)| <= tube.output_radius(c, t) at every time t. It is a statement on the exact
+    motion.
 
     Args:
         system: A cart-pole.
@@ -90,14 +93,15 @@ def held_statement(tube: HeldTube, proof: HeldTubeProof) -> Statement:
     """Return a tube of a held control as a line of a certificate."""
     p, angle = tube.steady_outputs[[0, 1]]
     plan, design = tube.plan, tube.design
-    holds = "holds of at most" if design.aperiodic else "held"
+    holds = f"holds of {SHORTEST * design.period:g} to" if design.aperiodic else "held"
     return Statement(
         f"ellipsoid tube, control {holds} {design.period:g} s, at the instants and between them, "
         f"all disturbances up to {design.disturbance_bound:g}, e(0) = 0: |theta - theta_d| "
-        f"<= {angle:.4g} rad, |p - p_d| <= {p:.4g} m, ||e|| <= {tube.steady_radius:.4g}, "
-        f"|u - u_d| <= {tube.largest_deviation:.4g} N for u = u_d + K e, K = "
-        f"{np.round(tube.gain[0], 3).tolist()}; it keeps the state in its box while |theta_d| <= "
-        f"{plan.angle:g} rad, |p_d'| <= {plan.velocity:g} m/s, |theta_d'| <= "
+        f"<= {at_most(angle)} rad, |p - p_d| <= {at_most(p)} m, ||e|| <= "
+        f"{at_most(tube.steady_radius)}, |u - u_d| <= {at_most(tube.largest_deviation)} N for "
+        f"u = u_d + K e, K = {np.round(tube.gain[0], 3).tolist()} (rounded); it keeps the state in "
+        f"its box while |theta_d| <= {plan.angle:g} rad, |p_d'| <= {plan.velocity:g} m/s, "
+        f"|theta_d'| <= "
         f"{plan.angular_rate:g} rad/s and |u_d| <= {plan.force:g} N",
         "proved",
         proof.proved,
@@ -106,15 +110,24 @@ def held_statement(tube: HeldTube, proof: HeldTubeProof) -> Statement:
 
 
 def _falls_at_instants(tube: HeldTube) -> bool:
-    """Show Q_0 > L W L' with L = (I; K) for every W of an instant."""
+    """Show Q_0 > L W L' with L = (I; K) for every W of an instant.
+
+    For holds of any length from `SHORTEST` h to h, W = sum_i b_i W_i with b_0 <= r (1 - b_0),
+    r = 1 / `SHORTEST`. So Q_0 - L W L' is a convex combination, but for a factor, of the matrices
+    D_i + c D_0 with D_i = Q_0 - L W_i L', i >= 1 and c from 0 to r, whose ends decide. D_0 alone is
+    zero but for its last entry, and K is rounded: holds as short as one likes are out of reach.
+    """
     joined = exact(np.concatenate([np.eye(_STATES), tube.gain]))
-    indices = range(1, len(tube.duals)) if tube.design.aperiodic else [len(tube.duals) - 1]
-    for index in indices:
+
+    def rises(index: int) -> Interval:
         block = exact(tube.duals[index, :_STATES, :_STATES])
-        moved = matmul(matmul(joined, block), transpose(joined))
-        if not negative_definite(moved - tube.duals[0]):
-            return False
-    return True
+        return matmul(matmul(joined, block), transpose(joined)) - exact(tube.duals[0])
+
+    if not tube.design.aperiodic:
+        return bool(negative_definite(rises(len(tube.duals) - 1)))
+    first = rises(0) * (1.0 / SHORTEST)
+    every = [rises(index) for index in range(1, len(tube.duals))]
+    return all(negative_definite(one) and negative_definite(one + first) for one in every)
 
 
 def _rests(tube: HeldTube) -> list[Interval]:

@@ -314,5 +314,5 @@ def load_metric(path: Path | str | None = None) -> Metric:
             raise ValueError(f"format {record['format']!r} is not {_FORMAT!r}")
         coefficients = np.array(record["coefficients"], dtype=np.float64)
         return Metric(coefficients, **design_arguments(record))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(f"{path} is not a metric written by save_metric: {error}") from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from decimal import ROUND_CEILING, Context
 from typing import Literal, get_args
 
 Kind = Literal["proved", "calibrated", "observed"]
@@ -38,3 +39,16 @@ class Statement:
             raise ValueError(f"kind={self.kind!r} must be one of {', '.join(get_args(Kind))}")
         if not (math.isfinite(self.seconds) and self.seconds >= 0.0):
             raise ValueError(f"seconds={self.seconds!r} must be finite and >= 0")
+
+
+def at_most(value: float, digits: int = 4) -> str:
+    """Return a number in words, rounded upwards: what is claimed is never less than was proved.
+
+    Args:
+        value: A bound from above.
+        digits: Significant digits.
+    """
+    if not math.isfinite(value):
+        return f"{value:g}"
+    rounded = Context(prec=digits, rounding=ROUND_CEILING).create_decimal_from_float(value)
+    return f"{float(rounded):.{digits}g}"

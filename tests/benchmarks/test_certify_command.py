@@ -13,6 +13,8 @@ from typer.testing import CliRunner
 from lagros_benchmarks import certify, certify_evidence, cli
 from lagros_policies.contraction import load_metric, save_metric
 from lagros_policies.contraction.certificate import Certificate, TubeSizes
+from lagros_policies.contraction.ellipsoid_axis import AxisEllipsoid, prove_axis_ellipsoid
+from lagros_policies.contraction.metric import metric_record
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.statement import Statement
 
@@ -42,6 +44,11 @@ def test_the_spacecraft_is_certified_without_flights(invoke, tmp_path):
     assert record["holds"]
     assert record["tube"]["observed"] is None
     assert {line["kind"] for line in record["statements"]} == {"proved", "observed"}
+    # An outsider proves the ellipsoid from the record alone.
+    kept = record["ellipsoid"]
+    tube = AxisEllipsoid(np.array(kept["W"]), np.array(kept["K"]), kept["tau"], kept["hold"])
+    assert prove_axis_ellipsoid(tube)
+    assert tube.position <= kept["position"]
 
 
 def test_u_star_itself_has_no_learning_error(invoke, tmp_path):
@@ -83,6 +90,105 @@ def test_a_file_that_is_no_metric_gives_status_one_and_no_traceback(
     assert "Traceback" not in result.output
 
 
+def spoiled_metric(**changes):
+    return {**metric_record(load_metric()), **changes}
+
+
+_EYE = np.eye(4).tolist()
+
+
+@pytest.mark.parametrize(
+    ("task", "record", "message"),
+    [
+        pytest.param(
+            "cartpole",
+            {"coefficients": [[[1.0, 0.0], [0.0, 1.0]]], "scaling": [1.0, 1.0]},
+            "size 2",
+            id="two states",
+        ),
+        pytest.param("cartpole", {"coefficients": [_EYE] * 2000}, "degree", id="large degree"),
+        pytest.param("cartpole", {"alpha": 10**400}, "is not a metric", id="enormous"),
+        pytest.param("cartpole", {"alpha": float("nan")}, "is not a metric", id="no number"),
+        pytest.param("cartpole", {"nu": -1.0}, "is not a metric", id="negative"),
+        pytest.param(
+            "cartpole",
+            {"coefficients": [(np.eye(4) + 1e-9 * np.eye(4, k=1)).tolist()]},
+            "symmetric",
+            id="almost symmetric",
+        ),
+        pytest.param("spacecraft", {"rate": 10**400}, "is not a metric", id="axis, enormous"),
+        pytest.param("spacecraft", {"stiffness": 1e308}, "is not a metric", id="axis, overflow"),
+        pytest.param("spacecraft", {"period": float("nan")}, "is not a metric", id="axis, nan"),
+    ],
+)
+def test_hostile_numbers_give_status_one_and_say_what_is_wrong(
+    invoke, tmp_path, task, record, message
+):
+    axis = {"format": certify_evidence.AXIS_FORMAT, "rate": 1.0, "stiffness": 3.0, "period": 0.1}
+    whole = spoiled_metric(**record) if task == "cartpole" else {**axis, **record}
+    (tmp_path / "bad.json").write_text(json.dumps(whole))
+    result = invoke(task, "--metric", "bad.json", "--episodes", "0")
+    assert result.exit_code == 1
+    assert isinstance(result.exception, SystemExit)
+    assert message in " ".join(result.output.split())
+    assert "bad.json" in result.output
+
+
+def test_nested_brackets_without_end_are_no_metric(invoke, tmp_path):
+    (tmp_path / "bad.json").write_text("[" * 100_000)
+    result = invoke("cartpole", "--metric", "bad.json")
+    assert result.exit_code == 1
+    assert "bad.json" in result.output
+
+
+def test_the_largest_multiple_of_a_box_is_found(monkeypatch):
+    """With a proof that succeeds up to a size: to a hundredth, from above and from below."""
+    from lagros_benchmarks import certify_box
+
+    class Proof:
+        def __init__(self, size, limit):
+            self.held = self.contraction = self
+            self.proved, self.bounds = size <= limit, 1.0
+            text = f"of {size:g}"
+            line = Statement(text, "proved", self.proved, 0.0)
+            chi = Statement("the chi of the file", "proved", False, 0.0)
+            self.statements = [line, chi, replace(line, text=f"{text}, held")]
+
+    for limit, box_is, last in ((1.234, "1.23", "1.24"), (0.5, "0.5", "0.51"), (9.0, "1.5", "")):
+        monkeypatch.setattr(
+            certify_box,
+            "prove_multiple",
+            lambda metric, factor, seconds, limit=limit: (
+                factor,
+                Proof(factor, limit),
+                Proof(factor, limit),
+            ),
+        )
+        box, lines = certify_box.largest_proofs(load_metric(), 1.0)
+        assert f"{box:g}" == box_is
+        assert all(line.holds for line in lines)
+        assert f"is {box_is} times" in lines[-1].text
+        assert (f"; {last} times was not proved" in lines[-1].text) == bool(last)
+    monkeypatch.setattr(
+        certify_box, "prove_multiple", lambda *_: (1.0, Proof(1.0, 0.0), Proof(1.0, 0.0))
+    )
+    box, lines = certify_box.largest_proofs(load_metric(), 1.0)
+    assert box == 1.0
+    assert not any(line.holds for line in lines)
+
+
+def test_a_multiple_of_the_box_is_proved_as_it_is(system_of_task):
+    from lagros_benchmarks import certify_box
+    from lagros_policies.contraction.proof.condition import prove_contraction
+
+    metric = certify_box.load_cartpole_metric(certify_evidence.metric_to_prove(None)[0])
+    box, first, second = certify_box.prove_multiple(metric, 0.1, 20.0)
+    assert box == ProofBox.apart(0.9, 1.5, 1.5, 1.0).scaled(0.1)
+    assert second.statements[-1].holds
+    assert second.contraction.box.lean == 1.0
+    assert first.contraction.proved == prove_contraction(system_of_task, metric, box).proved
+
+
 def test_a_file_that_is_missing_gives_status_one(invoke):
     assert invoke("cartpole", "--metric", "nowhere.json").exit_code == 1
 
@@ -108,6 +214,7 @@ def test_a_metric_of_the_axes_can_be_read_and_a_bad_one_is_refused(invoke, tmp_p
         ("cartpole", "--bound", "-1"),
         ("cartpole", "--episodes", "-3"),
         ("cartpole", "--seconds", "0"),
+        ("spacecraft", "--largest"),
     ],
 )
 def test_wrong_usage_gives_status_two(invoke, arguments):

@@ -49,6 +49,30 @@ def test_disturbances_that_change_within_a_hold_stay_inside(tube, seed):
         assert state @ inverse @ state <= 1.0 + 1e-9
 
 
+def test_between_the_instants_the_position_may_go_further_and_stays_in_its_bound(tube):
+    """A push that changes sign in a hold bulges the path, with the narrow one beyond its ends."""
+    root = np.linalg.cholesky(tube.dual)
+    largest = 0.0
+    for angle in np.linspace(0.0, 2.0 * np.pi, 181):
+        start = root @ np.array([np.cos(angle), np.sin(angle)])
+        acceleration, state = float(tube.gain @ start), start
+        for part in range(40):
+            way = 1.0 if part < 20 else -1.0
+            state = fine_step(state, acceleration, np.array([way, 0.0]), PERIOD / 40)
+            largest = max(largest, abs(state[0]))
+            assert abs(state[0]) <= tube.position
+    assert largest > 0.999 * tube.position_at_instants
+    if tube.position_at_instants < 0.2:
+        assert largest > tube.position_at_instants
+
+
+def test_a_matrix_that_is_not_symmetric_is_refused(tube):
+    # Its symmetric part is that of one that is proved.
+    skew = np.array([[0.0, 1e-3], [-1e-3, 0.0]])
+    assert not prove_axis_ellipsoid(replace(tube, dual=tube.dual * 1.5 + skew))
+    assert prove_axis_ellipsoid(tube)
+
+
 def test_the_worst_output_is_reached_by_its_own_disturbance_and_bounded_by_the_tube(tube):
     position = np.array([1.0, 0.0])
     worst = worst_output(tube.gain, PERIOD, position)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BPoly
 
-from lagros_policies.contraction import load_metric
+from lagros_policies.contraction import held_ellipsoid, load_metric
 from lagros_policies.contraction.certificate_cartpole import (
     CartPoleQuestion,
     cartpole_certificate,
@@ -18,10 +18,16 @@ from lagros_policies.contraction.held_design import (
     bernstein_rate,
     design_held_contained,
 )
-from lagros_policies.contraction.held_ellipsoid import held_statement, prove_held_tube
+from lagros_policies.contraction.held_ellipsoid import (
+    _falls_at_instants,
+    held_statement,
+    prove_held_tube,
+)
 from lagros_policies.contraction.proof.box import ProofBox
+from lagros_policies.contraction.proof.cells import Search, grid
 from lagros_policies.contraction.proof.intervals import exact
 from lagros_policies.contraction.proof.lifted import LiftedCondition
+from lagros_policies.contraction.statement import at_most
 from lagros_policies.contraction.tube_design import PlanBox
 
 PLAN = PlanBox(angle=0.05, velocity=0.3, angular_rate=0.1, force=0.3)
@@ -42,7 +48,7 @@ def test_it_is_proved_and_says_so(system, tube):
     line = held_statement(tube, proof)
     assert line.holds
     assert line.kind == "proved"
-    assert f"{tube.steady_outputs[1]:.4g} rad" in line.text
+    assert f"{at_most(tube.steady_outputs[1])} rad" in line.text
     # Worth having: below ten times the disturbance, in spite of the hold.
     assert tube.steady_radius < 10 * BOUND
 
@@ -59,7 +65,49 @@ def test_spoiled_tubes_are_refused(system, tube):
         replace(tube, error=0.9 * tube.error),
         replace(tube, plan=replace(PLAN, angle=0.6), error=tube.error),
     ):
-        assert not prove_held_tube(system, spoiled, 5.0).proved
+        assert not prove_held_tube(system, spoiled, 2.0).proved
+
+
+@pytest.mark.parametrize("tube", [True], indirect=True, ids=["aperiodic"])
+def test_a_gain_that_shorter_holds_do_not_allow_is_refused(tube):
+    """After a hold of no length V must not rise: with K = Y W_0^-1 alone, Q_0 - L W_0 L' >= 0."""
+    assert _falls_at_instants(tube)
+    other = replace(tube, gain=tube.gain * (1.0 + 1e-5))
+    assert not _falls_at_instants(other)
+    # Over whole holds there is room for as much.
+    assert _falls_at_instants(replace(other, design=replace(tube.design, aperiodic=False)))
+    # What the proof of the ends says of every W between the shortest hold and the longest.
+    joined = np.concatenate([np.eye(4), tube.gain])
+    for phase in (1e-3, 0.1, 0.5, 1.0):
+        moved = joined @ tube.dual_at(phase)[:4, :4] @ joined.T
+        assert np.linalg.eigvalsh(tube.duals[0] - moved)[0] > 0.0
+
+
+def test_every_coefficient_counts(tube):
+    """One in the middle that is larger widens the bounds, and is one of the instants or is not."""
+    duals = tube.duals.copy()
+    duals[1] *= 2.0
+    other = replace(tube, duals=duals)
+    errors = np.linalg.cholesky(duals[1])[:4, :4]
+    for output in np.eye(4):
+        assert other.output_radius(output, 1e3) >= np.linalg.norm(output @ errors) * (1 - 1e-9)
+    assert np.all(other.steady_outputs >= np.sqrt(np.diag(duals[1])[:4]))
+    assert other.steady_radius >= np.linalg.norm(errors, ord=2)
+    assert _falls_at_instants(other) != tube.design.aperiodic
+
+
+@pytest.mark.parametrize("failing", range(4))
+def test_a_coefficient_that_is_not_proved_leaves_no_tube(system, tube, monkeypatch, failing):
+    calls = []
+
+    def search(*_):
+        calls.append(None)
+        return Search(len(calls) != failing + 1, 1, 0.0)
+
+    monkeypatch.setattr(held_ellipsoid, "search", search)
+    assert not prove_held_tube(system, tube, 1.0).proved
+    calls.extend([None] * 9)
+    assert prove_held_tube(system, tube, 1.0).proved
 
 
 def draw(tube, count, seed):
@@ -196,6 +244,23 @@ def test_the_lifted_condition_encloses_what_it_speaks_of(system, oracle):
         assert np.all(gap <= reach[cell] + 1e-5)
         bent = max(bent, float(gap.max()))
     assert bent > 1e-3
+
+
+def test_every_pair_of_angles_lies_in_a_cell_that_counts(system):
+    box = ProofBox(0.4, 1.0, 1.5, 2.0, angle_error=0.1, angular_rate_error=0.5)
+    condition = LiftedCondition(system, box, np.eye(5), exact(np.zeros((5, 5))))
+    cells = grid(np.array([0.0, -0.4]), np.array([0.4, 0.4]), (16, 32))
+    start = condition.start()
+    assert np.all(start.lower.min(axis=0) == [0.0, -0.4])
+    assert np.all(start.upper.max(axis=0) == 0.4)
+    rng = np.random.default_rng(9)
+    angle = np.clip(rng.uniform(0.0, 0.5, 2000), 0.0, 0.4)
+    other = np.clip(angle + np.clip(rng.uniform(-0.15, 0.15, 2000), -0.1, 0.1), -0.4, 0.4)
+    place = np.stack([angle, other], axis=1)
+    for some in (start, cells):
+        counts = some[~condition.examine(some).empty]
+        inside = (counts.lower - 1e-9 <= place[:, None]) & (place[:, None] <= counts.upper + 1e-9)
+        assert np.all(np.any(np.all(inside, axis=2), axis=1))
 
 
 def test_rates_off_the_corners_are_between_them(system, oracle):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lagros_policies.contraction.proof.cells import Examined, grid, remainder, search
@@ -51,6 +51,40 @@ def test_a_search_that_gives_up_proves_nothing():
     assert found.undecided.shape == (2, 2)
 
 
+class Speck:
+    """cos(3 (x - a)) + cos(3 (y - b)) < height over the unit square: fails near (a, b) alone."""
+
+    def __init__(self, place, height):
+        self.place, self.height = place, height
+
+    def start(self):
+        return grid(np.zeros(2), np.ones(2), (2, 2))
+
+    def examine(self, cells):
+        shifted = [(cells[:, axis] - self.place[axis]) * 3.0 for axis in range(2)]
+        ends = np.stack([cells.lower, cells.upper], axis=1) - self.place
+        waves = np.cos(3.0 * ends)
+        corners = waves[:, :, None, 0] + waves[:, None, :, 1] - self.height
+        width = (cells.upper - cells.lower).T
+        parts = [
+            remainder((shifted[axis].cos() * -9.0)[:, None, None], width[axis]) for axis in range(2)
+        ]
+        empty = np.zeros(len(cells.lower), dtype=bool)
+        return Examined(exact(corners.reshape(-1, 4, 1, 1)), parts, parts, empty)
+
+    def failure(self, cells):
+        return None
+
+
+@settings(max_examples=12)
+@given(st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0)))
+def test_a_failure_that_no_corner_shows_is_never_proved_away(place):
+    """Wherever it is: no cell is lost, no half forgotten, no remainder left out."""
+    # Batches that leave cells waiting.
+    assert not search(Speck(place, 1.9999), 3, 300, 20.0).proved
+    assert search(Speck(place, 2.002), 20, 2000, 20.0).proved
+
+
 class Narrow(Wave):
     """The same, where wide cells divide by an interval that holds zero."""
 
@@ -89,3 +123,21 @@ def test_what_is_added_to_definite_matrices_leaves_them_definite(seed, size):
             moved = middle + np.einsum("i,ijk->jk", shares, push + noise)
             assert np.linalg.eigvalsh(moved).max() < 0.0
     assert size > 1e-3 or bool(negative_definite(exact(middle - np.eye(4)), added))
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_the_test_of_definiteness_is_sharp_on_diagonal_matrices(size):
+    """-1 with a radius, or with a multiple added, on either side of where it ceases to be so."""
+    middle, eye = -np.eye(size), np.eye(size)
+
+    def shown(radius, centre, around):
+        added = [Interval((centre - around) * eye, (centre + around) * eye)]
+        return bool(
+            negative_definite(Interval(middle - radius * eye, middle + radius * eye), added)
+        )
+
+    for parts in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.3, 0.3, 0.4)):
+        assert shown(*(0.999 * part for part in parts))
+        assert not shown(*(1.001 * part for part in parts))
+    assert not shown(0.0, 2.5, 0.0)
+    assert not negative_definite(exact(eye))

@@ -102,6 +102,22 @@ def test_the_lean_widens_the_forces_with_the_angle(system, metric):
         assert np.any(inside) == wanted
 
 
+@pytest.mark.parametrize("lean", [0.0, 1.0])
+def test_every_point_of_the_set_lies_in_a_cell_that_counts(system, metric, lean):
+    box = ProofBox(0.9, 1.5, 1.5, 1.0, lean=lean)
+    condition = HoldCondition(system, metric, box, RATE, PERIOD)
+    # After two halvings too, which leave cells across the largest push.
+    for cells in (condition.start(), condition._cells((12, 12, 16))):
+        counts = cells[~condition._outside(cells)]
+        rng = np.random.default_rng(5)
+        place = np.clip(rng.uniform(-1.3, 1.3, (3000, 3)), -1.0, 1.0) * [0.9, 1.5, 1.75]
+        place[:, 0] = np.abs(place[:, 0])
+        place[:, 2] += rng.choice([0.0, 0.5, 1.0], 3000) * lean * 1.1 * 9.8 * np.tan(place[:, 0])
+        slack = 1e-9
+        inside = (counts.lower - slack <= place[:, None]) & (place[:, None] <= counts.upper + slack)
+        assert np.all(np.any(np.all(inside, axis=2), axis=1))
+
+
 @pytest.mark.slow
 def test_the_shipped_proof_over_the_hold_can_be_made_again(system, metric):
     box = ProofBox(0.9, 1.5, 1.5, 1.0, lean=1.0)

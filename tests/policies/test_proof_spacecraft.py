@@ -6,6 +6,8 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from lagros_envs.dynamics import control_matrix
 from lagros_envs.dynamics.spacecraft import Spacecraft
@@ -27,6 +29,17 @@ def test_the_metrics_of_least_chi_are_proved(rate, period):
     assert proof.rate == pytest.approx(rate, rel=1e-8)
     assert metric.state_condition <= proof.condition * (1.0 + 1e-12)
     assert proof.condition == pytest.approx(metric.state_condition, rel=1e-6)
+
+
+@given(st.floats(1e-4, 0.5), st.floats(0.9, 1.1))
+def test_the_condition_number_is_never_below_the_exact_one(rate, stiffness):
+    """In fractions, chi + 1/chi + 2 = trace^2 / det; close to one, where digits cancel."""
+    metric = AxisMetric(rate, stiffness, 0.0)
+    found = Fraction(prove_axis(metric).condition)
+    trace = 1 + Fraction(metric.stiffness)
+    determinant = Fraction(metric.stiffness) - Fraction(metric.coupling) ** 2
+    assert (found + 1) ** 2 * determinant >= trace**2 * found
+    assert float(found) == pytest.approx(metric.state_condition, rel=1e-6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +102,21 @@ class Lopsided(Spacecraft):
 def test_a_body_whose_reach_depends_on_the_heading_is_refused():
     assert control_square(Lopsided()) is None
     assert not any(part.holds for part in prove_spacecraft(design_axis(0.3), body=Lopsided()))
+
+
+@dataclass(frozen=True)
+class Oblong(Spacecraft):
+    """A body that is pushed harder along one axis: at no heading but its own is B B' the same."""
+
+    def wrench(self, control):
+        first, second, torque = super().wrench(control)
+        return 2 * first, second, torque
+
+
+def test_a_reach_that_is_diagonal_at_one_heading_alone_is_refused():
+    gain = control_matrix(Oblong(), np.zeros(6))
+    np.testing.assert_allclose(gain @ gain.T, np.diag([0.0, 0.0, 0.0, 16.0, 4.0, 2.0]))
+    assert control_square(Oblong()) is None
 
 
 def test_the_statements_say_for_all_states_and_are_proved():

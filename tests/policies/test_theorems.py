@@ -35,6 +35,43 @@ def test_the_drift_bounds_the_relative_slope_of_the_metric_closely(metric, const
     assert metric_drift(constant_metric, 0.8) == 0.0
 
 
+@pytest.mark.parametrize(("constant", "slope"), [(0.5, 1.4), (2.0, -1.4)])
+def test_the_drift_of_few_cells_is_a_bound_or_an_error(metric, constant, slope):
+    """A metric that shrinks, or grows, with the angle: midpoints alone would say too little."""
+    coefficients = np.stack([constant * np.eye(4), slope * np.eye(4)])
+    plain = replace(metric, coefficients=coefficients)
+    angle = np.linspace(0.0, 0.8, 2001)
+    largest = np.abs(slope * np.sin(angle) / (constant + slope * np.cos(angle))).max()
+    proved = 0
+    for cells in (1, 2, 4, 8, 64, 1000):
+        try:
+            assert metric_drift(plain, 0.8, cells) >= largest
+        except ValueError:
+            continue
+        proved += 1
+    assert proved > 0
+
+
+def test_the_disturbed_rate_is_what_the_worst_error_needs(metric, oracle):
+    """At the angle and the error that feel the disturbance most, 2 lost V is what it adds."""
+    angle = np.linspace(0.0, 0.8, 801)
+    states = np.zeros((801, 4))
+    states[:, 1], states[:, 3] = angle, 1.0
+    dual, slope = metric.dual(states), metric.dual_rate(states)
+    values = np.abs(np.linalg.eigvals(np.linalg.solve(dual, slope)).real).max(axis=1)
+    place = int(np.argmax(values))
+    pairs, vectors = np.linalg.eig(np.linalg.solve(dual[place], slope[place]))
+    pull = vectors[:, np.argmax(np.abs(pairs))].real
+    error = dual[place] @ pull / np.linalg.norm(dual[place] @ pull)
+    here, h = np.array([0.0, angle[place], 0.0, 0.0]), 1e-6
+    push = np.array([0.0, 0.3, 0.0, 0.0])
+    ahead, back = (here + side * h * push for side in (1.0, -1.0))
+    moved = oracle.energy(metric, ahead, ahead - error) - oracle.energy(metric, back, back - error)
+    added, energy = abs(float(moved)) / (2 * h), float(oracle.energy(metric, here, here - error))
+    lost = metric.contraction_rate - disturbed_rate(metric, metric_drift(metric, 0.8), 0.3)
+    assert added <= 2.0 * lost * energy * (1 + 1e-4) <= 1.3 * added
+
+
 def test_the_disturbed_rate_covers_what_moves_the_metric(metric, oracle):
     """dV/dt under a disturbance of the angle exceeds the paper's bound, and not ours."""
     drift, bound = metric_drift(metric, 0.8), 0.3
@@ -67,6 +104,25 @@ def test_the_lipschitz_constant_encloses_sampled_norms(system, oracle):
     assert 0.9 * found.lower <= norms.max()
     assert found.lower <= found.upper <= 1.1 * found.lower
     assert growth.max() <= found.growth <= found.upper
+
+
+def test_few_cells_make_the_lipschitz_constant_larger_not_smaller(system, oracle):
+    box = ProofBox(0.7, 1.0, 2.0, 6.0)
+    state = np.zeros((2001, 4))
+    state[:, 1] = np.linspace(-0.7, 0.7, 2001)
+    corners = [(force, speed) for force in (-6.5, 6.5) for speed in (-2.0, 2.0)]
+    largest = growth = 0.0
+    for force, speed in corners:
+        state[:, 3] = speed
+        u = np.full((2001, 1), force)
+        slope = oracle.jacobian(lambda x, u=u: oracle.rates(x, u), state)
+        largest = max(largest, np.linalg.norm(slope, ord=2, axis=(1, 2)).max())
+        symmetric = 0.5 * (slope + np.swapaxes(slope, 1, 2))
+        growth = max(growth, np.linalg.eigvalsh(symmetric)[:, -1].max())
+    for cells in (2, 5, 11):
+        found = lipschitz_constant(system, box, cells)
+        assert largest <= found.upper
+        assert growth <= found.growth
 
 
 def test_a_box_with_a_lean_is_refused(system):

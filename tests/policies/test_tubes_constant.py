@@ -1,12 +1,13 @@
 """Tubes of constant metrics: the programs, the proof, and closed loops that try to leave."""
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
 
 from lagros_policies.contraction.cvstem import InfeasibleError
-from lagros_policies.contraction.ellipsoid import TubeControl, prove_tube
+from lagros_policies.contraction.ellipsoid import TubeControl, _source, prove_tube
 from lagros_policies.contraction.tube_design import (
     PlanBox,
     TubeDesign,
@@ -137,7 +138,23 @@ def test_a_tube_is_proved_and_spoiled_ones_are_not(system, ellipsoid):
         # No control.
         replace(ellipsoid, control_weight=1e-6),
     ):
-        assert not prove_tube(system, spoiled, 5.0).proved
+        assert not prove_tube(system, spoiled, 1.0).proved
+
+
+@pytest.mark.parametrize(("bound", "rate"), [(0.05, 0.8), (0.1, 0.3), (0.75, 0.7)])
+def test_what_the_disturbance_adds_is_enclosed(bound, rate):
+    found = _source(TubeDesign(rate=rate, disturbance_bound=bound))
+    exactly = Fraction(bound) ** 2 / (2 * Fraction(rate))
+    assert Fraction(float(found.lower)) <= exactly <= Fraction(float(found.upper))
+    assert found.upper - found.lower < 1e-14
+    assert _source(TubeDesign("paper", rate=rate, disturbance_bound=bound)).upper == 0.0
+
+
+@pytest.mark.parametrize("factor", [0.25, 4.0])
+def test_the_bounds_of_theorem_1_do_not_depend_on_the_scale_of_the_metric(paper, factor):
+    other = replace(paper, dual=factor * paper.dual)
+    np.testing.assert_allclose(other.steady_outputs, paper.steady_outputs)
+    assert other.steady_radius == pytest.approx(paper.steady_radius)
 
 
 def test_a_disturbance_without_a_contained_tube_is_refused(system):

@@ -16,7 +16,7 @@ from lagros_policies.contraction.proof.condition import (
     prove_contraction,
 )
 from lagros_policies.contraction.proof.hold import HeldViolation, HoldCondition
-from lagros_policies.contraction.statement import Statement
+from lagros_policies.contraction.statement import Statement, at_most
 
 # Cells of one pass of the condition over a hold.
 _BATCH = 400
@@ -73,8 +73,8 @@ def prove_cartpole(
     statements = [
         Statement(
             f"-dW/dt + 2 sym(A W) - 2 nu B B' < -2 alpha W, equation (14), with alpha = "
-            f"{proof.contraction_rate:g} 1/s and nu = {metric.control_weight:.6g} for "
-            f"{describe(box)}",
+            f"{proof.contraction_rate:g} 1/s and nu = {metric.control_weight:.6g} (W as in its "
+            f"file) for {describe(box)}",
             "proved",
             proof.proved,
             proof.seconds,
@@ -87,12 +87,17 @@ def prove_cartpole(
         rate = metric.contraction_rate if held_rate is None else held_rate
         condition = HoldCondition(system, metric, held_box, rate, period)
         held = search(condition, _BATCH, 1_000_000, most_seconds)
+        start = time.monotonic()
+        after = condition.largest_angle_after()
+        definite = _definite(system, metric, max(after, held_box.angle))
         text = (
             f"under a force held for {period:g} s, some force shrinks an infinitesimal error by "
             f"exp(-alpha {period:g} s) in the metric from one control instant to the next, with "
-            f"alpha = {rate:g} 1/s, for {describe(replace(held_box, **_NO_ERRORS))}"
+            f"alpha = {rate:g} 1/s, for {describe(replace(held_box, **_NO_ERRORS))}; W is positive "
+            f"definite wherever the hold ends, |theta| <= {at_most(after)} rad"
         )
-        statements.append(Statement(text, "proved", held.proved, held.seconds))
+        seconds = held.seconds + time.monotonic() - start
+        statements.append(Statement(text, "proved", held.proved and definite, seconds))
     return CartPoleProof(statements, proof, bounds, held)
 
 
@@ -122,17 +127,26 @@ def describe(box: ProofBox) -> str:
 _NO_ERRORS = {"angle_error": 0.0, "angular_rate_error": 0.0}
 
 
+def _definite(system: CartPole, metric: Metric, angle: float) -> bool:
+    """Return whether W_bar is shown to be positive definite for every |theta| <= angle."""
+    try:
+        prove_bounds(system, metric, angle)
+    except ValueError:
+        return False
+    return True
+
+
 def _bounds(
     system: CartPole, metric: Metric, box: ProofBox
 ) -> tuple[ProvedBounds | None, Statement]:
     """Prove I <= S W_bar S <= chi I and b_bar on the box."""
     start = time.monotonic()
-    claim = f"I <= S W S <= chi I with chi = {metric.condition_bound:.6g} "
+    claim = f"I <= S W S <= chi I with chi = {at_most(metric.condition_bound, 6)} "
     where = f"for every |theta| <= {box.angle:g} rad"
     try:
         bounds = prove_bounds(system, metric, box.angle)
     except ValueError:
         return None, Statement(claim + where, "proved", False, time.monotonic() - start)
     holds = bounds.least >= 1.0 and bounds.largest <= metric.condition_bound
-    text = f"{claim}and ||B|| <= b_bar = {bounds.control_gain:.6g} {where}"
+    text = f"{claim}and ||B|| <= b_bar = {at_most(bounds.control_gain, 6)} {where}"
     return bounds, Statement(text, "proved", holds, bounds.seconds)

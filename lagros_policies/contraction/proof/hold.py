@@ -7,7 +7,8 @@ G = dPhi/du, x' = Phi(x, u_d) and L any matrix of three rows with L G = 0, the c
 
 Then, for every displacement e of x, some deviation v makes (F e + G v)' M(x') (F e + G v) at most
 exp(-2 alpha h) e'M(x)e, by a Schur complement; by Finsler's lemma it is the same to ask that
-F W_bar F' - nu_h G G' < exp(-2 alpha h) W_bar(x') for some nu_h. That is the condition that
+F W_bar F' - nu_h G G' < exp(-2 alpha h) W_bar(x') for some nu_h. (W_bar must be positive definite
+at x and at x', which may lie outside the box: `largest_angle_after`.) That is the condition that
 `HeldControl` imposes, for an infinitesimal error: the sampled loop is contracting in the metric, at
 the rate alpha, while it stays in the box. L = [I, -g] with g = G_i / G_4, which is smooth: the
 force moves the pole's rate everywhere.
@@ -40,6 +41,8 @@ BoolArray = NDArray[np.bool_]
 
 _ANGLE, _RATE, _PUSH = range(3)
 _FIRST = (6, 6, 4)
+# Cells that enclose where a hold ends.
+_IMAGE = (20, 10, 6)
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)))
 # Directions of the Jacobians: the state but for the position, and the force.
 _SEEDS = 4
@@ -85,11 +88,25 @@ class HoldCondition:
 
     def start(self) -> Interval:
         """Return the first cells (k, 3) of angle, rate and push."""
+        return self._cells(_FIRST)
+
+    def largest_angle_after(self) -> float:
+        """Bound |theta| after a hold from anywhere in the box [rad]; it may lie outside the box.
+
+        V after the hold is measured by W_bar(x') there, so that it must be positive definite there
+        too.
+        """
+        cells = self._cells(_IMAGE)
+        after = self.map([Series([cells[:, index]]) for index in range(3)])[2].parts[0]
+        return float(np.maximum(np.abs(after.lower), np.abs(after.upper)).max())
+
+    def _cells(self, counts: tuple[int, ...]) -> Interval:
+        """Cut the box into equal cells (k, 3) of angle, rate and push."""
         box = self.box
         cells = grid(
             np.array([0.0, -box.angular_rate, -self.push]),
             np.array([box.angle, box.angular_rate, self.largest_push(box.angle)]),
-            _FIRST,
+            counts,
         )
         return cells[~self._outside(cells)]
 

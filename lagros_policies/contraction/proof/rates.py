@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +49,7 @@ BoolArray = NDArray[np.bool_]
 _ANGLE, _OTHER, _RATE = range(3)
 _FIRST_ANGLES = 8
 _FIRST_RATES = 2
-# The triangle around (w, w^2) and the range of the rates are widened by this, so that their rounded
-# corners still enclose them.
+# The range of the rates of x is widened by this, so that its rounded ends still enclose it.
 _ROUNDING = 1e-9
 
 
@@ -76,7 +76,7 @@ class _Corner:
     balance: FloatArray
     rate: FloatArray  # of x
     other_rate: FloatArray  # of y
-    square: FloatArray
+    square: Interval
     real: bool  # whether it is a point of the set, not the tip of a triangle
 
 
@@ -162,11 +162,11 @@ class RateCondition:
         """Return the corners of what the matrix is affine in."""
         box = self.box
         low, high = cells.lower[:, _RATE], cells.upper[:, _RATE]
-        middle, product = 0.5 * (low + high), low * high
+        middle, tip = triangle_tip(low, high)
         points = [
-            (low, low * low + _ROUNDING, True),
-            (high, high * high + _ROUNDING, True),
-            (middle, product - _ROUNDING, False),
+            (low, exact(low).square(), True),
+            (high, exact(high).square(), True),
+            (middle, exact(tip), False),
         ]
         leans = (0.0, box.lean) if box.lean > 0.0 else (0.0,)
         error = self.rate_error
@@ -215,7 +215,7 @@ class RateCondition:
         by_square = twice_symmetric(slopes.by_square.derivative(0), weight)
         moving = dual.derivative(1)
 
-        def spread(values: FloatArray) -> FloatArray:
+        def spread(values: Any) -> Any:
             return values[:, None, None, None, None]
 
         found = [
@@ -264,21 +264,39 @@ class RateCondition:
         """Enclose a derivative of J over cells and all that it is affine in."""
         rate = cells[:, _RATE]
         square = rate.square()
-        tip = Interval(np.minimum(square.lower, rate.lower * rate.upper), square.upper)
-        tip = Interval(tip.lower - 2.0 * _ROUNDING, tip.upper + 2.0 * _ROUNDING)
+        low = np.minimum(square.lower, triangle_tip(rate.lower, rate.upper)[1])
         size = np.ones(len(cells.lower))
         return slopes.at(
             order,
             _wide(Interval(-self.push * size, self.push * size)),
             _wide(Interval(0.0 * size, self.box.lean * size)),
             _wide(rate),
-            _wide(tip),
+            _wide(Interval(low, square.upper)),
         )
 
     def _rate_of_state(self, cells: Interval) -> Interval:
         """Enclose the rate of x."""
         error = self.rate_error + 2.0 * _ROUNDING
         return cells[:, _RATE] + Interval(-error, error)
+
+
+def triangle_tip(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the third corner (m, q) of a triangle around the parabola (w, w^2) on [low, high].
+
+    The other two are on the parabola, (low, low^2) and (high, high^2). The edges from there to
+    (m, q) lie below it where they are no steeper than its tangents, q <= 2 a m - a^2 for both ends
+    a: so m may be rounded, and q is rounded downwards.
+
+    Args:
+        low: Lower ends, shape (k,).
+        high: Upper ends, shape (k,).
+
+    Returns:
+        m and q, each of shape (k,).
+    """
+    middle = 0.5 * (low + high)
+    tangents = [exact(end) * middle * 2.0 - exact(end).square() for end in (low, high)]
+    return middle, np.minimum(tangents[0].lower, tangents[1].lower)
 
 
 def fails(system: CartPole, metric: Metric, point: Violation) -> bool:

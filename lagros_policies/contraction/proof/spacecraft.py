@@ -20,7 +20,7 @@ from typing import Any
 
 from lagros_envs.dynamics.spacecraft import HEADING, VELOCITY_X, Spacecraft
 from lagros_policies.contraction.double_integrator import AxisMetric
-from lagros_policies.contraction.statement import Statement
+from lagros_policies.contraction.statement import Statement, at_most
 
 # The condition of an optimal metric is an equality, which rounding may miss by one unit in the last
 # place; it is proved for a rate that is less by this share.
@@ -128,7 +128,8 @@ def prove_spacecraft(
         )
         text = (
             f"{name}: some control makes V contract for all states, {when} with alpha = "
-            f"{proof.rate:.6g} 1/s; W is positive definite with chi <= {proof.condition:.6g}"
+            f"{metric.rate:g} (1 - 1e-9) 1/s; W is positive definite with chi <= "
+            f"{at_most(proof.condition, 6)}"
         )
         seconds = time.monotonic() - start
         holds = proof.holds and square is not None
