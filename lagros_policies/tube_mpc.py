@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
-from lagros_policies.contraction import Metric, load_metric
+from lagros_policies.contraction import ContractionMetric, load_metric
 from lagros_policies.expert import CartPoleExpert, TrackedPlans
 from lagros_policies.planning import Trajectory
 from lagros_policies.policy import PolicyState, row_memories
@@ -72,7 +72,7 @@ class TubeMpcPolicy:
     def __init__(
         self,
         settings: task.CartPoleSettings | None = None,
-        metric: Metric | str | Path | None = None,
+        metric: ContractionMetric | str | Path | None = None,
         replan_every: int = 1,
         deadline: float = 0.1,
         clock: Callable[[], float] = time.perf_counter,
@@ -83,8 +83,9 @@ class TubeMpcPolicy:
                 f"replan_every={replan_every!r} must be >= 1 and deadline={deadline!r} > 0"
             )
         self.settings = settings or task.CartPoleSettings()
-        loaded = metric if isinstance(metric, Metric) else load_metric(metric)
-        self.expert = CartPoleExpert(loaded, self.settings)
+        if metric is None or isinstance(metric, str | Path):
+            metric = load_metric(metric)
+        self.expert = CartPoleExpert(metric, self.settings)
         self.replan_every = replan_every
         self.deadline = deadline
         self._clock = clock

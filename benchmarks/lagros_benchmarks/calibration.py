@@ -89,7 +89,6 @@ def cartpole_scores(
     seed: int = 0,
     kind: str = "uniform",
     bound: float = 0.75,
-    expert: CartPoleExpert | None = None,
 ) -> EpisodeScores:
     """Fly episodes of the cart-pole and return their scores.
 
@@ -100,13 +99,12 @@ def cartpole_scores(
         seed: Seed of the run.
         kind: Kind of the disturbance.
         bound: d_bar, in units of the state per second.
-        expert: Planner and u*; the shipped metric's if None.
 
     Returns:
         `CARTPOLE_SCORES` of every episode.
     """
     begun = perf_counter()
-    expert = expert or CartPoleExpert()
+    expert = CartPoleExpert()
     seeds = episode_seeds(seed, count, namespace)
     parts = [
         _cartpole_chunk(policy, seeds[at : at + _CHUNK], kind, bound, expert)

@@ -215,7 +215,8 @@ class BenchmarkSettings:
         if "worst" in self.disturbances:
             raise ValueError(
                 "disturbance 'worst' pushes away from one nominal trajectory that all policies "
-                "share, which the spacecraft's do not: each makes its own way. Valid: "
+                "share, which the spacecraft's do not: each makes its own way, and `lagros attack "
+                "spacecraft` searches the worst of each. Valid: "
                 f"{', '.join(kind for kind in KINDS if kind != 'worst')}."
             )
 

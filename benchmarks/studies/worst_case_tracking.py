@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.worst_case.optimisers import make_search
+from lagros_benchmarks.worst_case.plane import worst_plane_pushes
 from lagros_benchmarks.worst_case.seeds import ATTACK
 from lagros_envs.disturbances import Disturbance, onto_unit_sphere
 from lagros_envs.dynamics import hold_step
@@ -151,7 +152,21 @@ def spacecraft_case(bound: float) -> dict[str, Any]:
             "searched",
             loop.fly(every, adversary(np.tile(point, (count, 1)), directions(rng, count))),
         )
+    note("climbed", loop.fly(every, given(climbed_pushes(loop, directions(rng, count)))))
     return {"unplanned": loop.unplanned, "rows": rows, "adversaries": best.tolist()}
+
+
+def climbed_pushes(loop: Tracking, ways: FloatArray) -> FloatArray:
+    """Return the sequence that the error's own loop stands worst, along directions (b, 2).
+
+    Returns:
+        d/d_bar, shape (b, steps, 6).
+    """
+    along = worst_plane_pushes(loop.tracking, loop.bound, loop.settings.steps)
+    pushes = np.zeros((len(ways), len(along), 6))
+    pushes[..., :2] = along[:, :1] * ways[:, None]
+    pushes[..., 3:5] = along[:, 1:] * ways[:, None]
+    return pushes
 
 
 def given(pushes: FloatArray) -> Callable[[FloatArray, int], FloatArray]:

@@ -119,8 +119,18 @@ class AdaptiveControl:
             u = u* - Y a_hat and u*, both of shape (..., 1) [N].
         """
         wanted = self.law(state, nominal, nominal_control, preferred)
+        return self.corrected(state, wanted, estimate), wanted
+
+    def corrected(self, state: FloatArray, wanted: FloatArray, estimate: FloatArray) -> FloatArray:
+        """Return u = u* - Y a_hat, shape (..., 1) [N].
+
+        Args:
+            state: x, shape (..., n).
+            wanted: u*, shape (..., 1).
+            estimate: a_hat, shape (..., k).
+        """
         known = np.sum(self.regressor(state, wanted) * estimate, axis=-1, keepdims=True)
-        return wanted - known, wanted
+        return np.asarray(wanted - known)
 
     def update(
         self,

@@ -25,6 +25,8 @@ def test_attack_writes_its_figures_and_flies_them_again(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert "goal clearance, bound 0.3" in done.output
     row = json.loads(figures.read_text())
+    left = sum(not one["measures"]["in_region"] for one in row["outcomes"])
+    assert f"which {left} of 2 flights left" in done.output
     assert (row["task"], row["policy"], row["bound"]) == ("cartpole", "lqr", 0.3)
     assert len(row["outcomes"]) == len(row["random_outcomes"]) == 2
     assert row["score_worst"] == max(one["score"] for one in row["outcomes"])
@@ -40,6 +42,12 @@ def test_attack_writes_its_figures_and_flies_them_again(tmp_path: Path) -> None:
     wrong = RUNNER.invoke(app, ["attack", "cartpole", "--replay", str(sequences)])
     assert wrong.exit_code == 1
     assert "1 of 2 differ" in wrong.output
+
+    # So are pushes that the stated bound does not allow.
+    save_worst_cases(replace(cases, pushes=1.01 * cases.pushes), sequences)
+    outside = RUNNER.invoke(app, ["attack", "cartpole", "--replay", str(sequences)])
+    assert outside.exit_code == 2
+    assert "above the bound 0.3" in outside.output
 
 
 @pytest.mark.parametrize(

@@ -138,6 +138,7 @@ def test_percent_rounds_to_certainty_only_if_it_is(rate, text):
 def test_the_paper_letters_its_methods():
     assert formats.policy_label("tube-mpc") == "(b) tube-mpc"
     assert formats.policy_label("runs/ppo.zip") == "ppo.zip"
+    assert formats.policy_label("a_package.policies:Mine") == "Mine"
 
 
 def test_csv_has_a_line_per_row_and_no_curves(rows):

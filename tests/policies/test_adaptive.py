@@ -120,6 +120,22 @@ def test_nothing_is_learned_where_nothing_is_wrong(law, plans):
     assert states == pytest.approx(plans[0], abs=1e-4)
 
 
+def test_the_estimate_moves_along_the_push_in_the_metric_where_the_step_ends(law):
+    rng = np.random.default_rng(2)
+    state, following = rng.uniform(-0.8, 0.8, (2, 20, 4))
+    nominal, estimate = rng.uniform(-0.8, 0.8, (20, 4)), rng.uniform(-0.5, 0.5, (20, 1))
+    wanted = rng.uniform(-10.0, 10.0, (20, 1))
+    ahead, behind = (hold_step(MODEL, state, wanted + sign * 1e-4, PERIOD) for sign in (1.0, -1.0))
+    push = (ahead - behind) / 2e-4
+    matrix = np.stack([law.metric.matrix(one) for one in following])
+    pull = np.sum(push * (matrix @ (following - nominal)[..., None])[..., 0], axis=-1)
+    moved = AdaptiveControl(law, friction_regressor, (0.3,)).update(
+        estimate, state, wanted, following, nominal
+    )
+    wanted_move = 0.3 * -state[:, 2] * pull
+    assert (moved - estimate)[:, 0] == pytest.approx(wanted_move, rel=1e-5)
+
+
 def test_gain_keeps_kappa_below_its_limit(law):
     rng = np.random.default_rng(1)
     reach = (1.5, 8.0)

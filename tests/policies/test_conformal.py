@@ -115,6 +115,11 @@ def test_split_coverage_is_near_the_level_and_reproducible() -> None:
     shares = [split_coverage(scores, 300, 0.9, 200, np.random.default_rng(4)) for _ in range(2)]
     assert shares[0] == shares[1]
     assert shares[0] == pytest.approx(0.9, abs=0.01)
+    # With one fresh episode of ten it is not covered where it is the largest: one time in ten.
+    few = np.random.default_rng(5).permutation(np.arange(10.0))
+    assert split_coverage(few, 9, 0.9, 4000, np.random.default_rng(6)) == pytest.approx(
+        0.9, abs=0.02
+    )
     with pytest.raises(ValueError, match="calibration=900"):
         split_coverage(scores, 900, 0.9, 10, np.random.default_rng(0))
 
@@ -125,5 +130,9 @@ def test_statement_says_level_and_law_and_holds_only_if_it_bounds() -> None:
     assert (line.kind, line.holds, line.seconds) == ("calibrated", True, 2.0)
     for part in ("the error is at most 89 m", "probability 0.9", "uniform, d_bar = 1", "99 episo"):
         assert part in line.text
+    # The bound is the 90th of 99: the share that it covers has the law Beta(90, 10).
+    covered = np.sort(np.random.default_rng(7).random((20_000, 99)), axis=1)[:, 89]
+    said = float(line.text.split("at least ")[1].split(" %")[0]) / 100.0
+    assert said == pytest.approx(float(np.quantile(covered, 0.025)), abs=0.005)
     nothing = conformal_bound(np.full(99, np.inf), 0.9)
     assert not bound_statement("the error", "m", nothing, "", 0.0).holds

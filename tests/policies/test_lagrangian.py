@@ -114,6 +114,16 @@ def test_the_peak_is_reached_by_the_disturbance_that_it_names():
     assert peak < hierarchical_bound(axis, bound, 600).position[-1]
 
 
+def test_the_bound_for_ever_counts_what_happens_between_instants():
+    axis, bound = SlidingAxis(8.0, 8.0, PERIOD), 0.3
+    limits = hierarchical_bound(axis, bound, 400)
+    by_sliding, by_error = axis.gains
+    # A deviation v bends the path by h^2/8 v at the middle of a hold, d by half a hold and h^2/8.
+    bend = PERIOD**2 / 8 * (by_sliding * limits.sliding[-1] + by_error * limits.position[-1])
+    drift = (PERIOD / 2 + PERIOD**2 / 8) * bound
+    assert steady_position_bound(axis, bound) == pytest.approx(limits.position[-1] + bend + drift)
+
+
 def test_bound_from_an_initial_error_holds_without_disturbance():
     axis = SlidingAxis(2.0, 1.0, PERIOD)
     start = np.array([0.4, 0.0, 0.0, -0.2, 0.0, 0.0])

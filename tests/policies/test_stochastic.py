@@ -39,6 +39,19 @@ def test_it_is_exact_for_a_linear_system_whose_metric_is_tight():
     assert without_angle.mean_square(times) == pytest.approx(
         known - 0.1**2 / (2 * alpha) * (1.0 - np.exp(-2 * alpha * times))
     )
+    # ||e||^2 is E V over the least eigenvalue of M, wherever in the region that is.
+    stiff = SimpleNamespace(
+        **{
+            **vars(metric),
+            "matrix": lambda states: (
+                np.diag([0.25, 4.0, 1.0, 1.0]) * np.cos(states[..., 1])[..., None, None]
+            ),
+        }
+    )
+    bound = mean_square_bound(stiff, g * [1, 0, 1, 1], start)
+    least = 0.25 * np.cos(Region().angle)
+    assert bound.least_eigenvalue == pytest.approx(least)
+    assert bound.mean_square(times) == pytest.approx(bound.energy(times) / least)
     # With noise on the angle eps > 0 costs a little of the rate, but a constant metric nearly none.
     bound = mean_square_bound(metric, g, start).mean_square(times)
     assert np.all(bound >= known - 1e-12)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.episodes import TUBE_TOLERANCE
-from lagros_benchmarks.worst_case.cartpole import Episodes, Flights
+from lagros_benchmarks.worst_case.cartpole import CartPoleTarget, Episodes, Flights, fly
 from lagros_envs import cartpole_task as task
 from lagros_envs.dynamics import control_matrix
 from lagros_policies.contraction import certified_tube
@@ -105,6 +105,31 @@ class TubeCheck:
             )
             missed[flight, step] = np.abs(flights.forces[flight, step, 0] - wanted[:, 0])
         return np.asarray(missed.max(axis=1))
+
+
+@dataclass(frozen=True)
+class CertificateTarget(CartPoleTarget):
+    """The same flights, scored by what they use of the tube of Theorem 1 while it holds.
+
+    What breaks the published tube throws the pole about, and has left the region of the metric by
+    then; this looks for the share that counts.
+
+    Attributes:
+        check: The tube; it must be given.
+    """
+
+    check: TubeCheck | None = None
+
+    @property
+    def slope_cost(self) -> int:
+        """None: the share has a jump where a flight leaves the region."""
+        return 0
+
+    def scores(self, episode: IntArray, sequences: FloatArray) -> FloatArray:
+        """Return the largest share (b,) of the tube under d/d_bar (b, steps, 4)."""
+        assert self.check is not None
+        flights = fly(self.flown, self.law, episode, self.bound * sequences)
+        return self.check.hold(episode, flights).certified_share
 
 
 def largest_gain(expert: CartPoleExpert, points: int = 1001) -> float:

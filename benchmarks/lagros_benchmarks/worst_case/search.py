@@ -163,7 +163,7 @@ def search(target: Target, settings: SearchSettings, seed: int = 0) -> list[Foun
     children = np.random.SeedSequence(seed).spawn(target.episodes)
     streams = [np.random.default_rng(child) for child in children]
     pool = _Pool.empty(target, settings.restarts)
-    _try(target, pool, target.starts())
+    _try(target, pool, target.starts()[:, : settings.budget])
     if settings.method == "gradient":
         _try(target, pool, _random_starts(target, settings.restarts, streams))
     else:

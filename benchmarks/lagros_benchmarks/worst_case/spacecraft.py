@@ -31,7 +31,7 @@ PARAMETERS = 9
 _DIRECTIONS = 7
 # Lookahead of the parameter 0 [s]; one more makes it e times as long.
 _LOOKAHEAD = 1.0
-# What a search tries first, each on its own: the first five directions and two opposites.
+# What a search tries first, each on its own: the directions that know something of the world.
 _FIRST = (0, 1, 2, 3, 4)
 
 
@@ -159,8 +159,8 @@ class SpacecraftTarget:
             raise ValueError(f"goal {self.goal!r} must be one of {', '.join(GOALS)}")
         if self.goal == "tube" and self.margin is None:
             raise ValueError(
-                "goal 'tube' needs a policy that tracks one plan with u*: centralized without the "
-                "safety filter; attack the others with success or clearance"
+                "goal 'tube' needs a policy with a certified tracking law and no safety filter: "
+                "--policy centralized; attack the others with --goal success or clearance"
             )
         remember_plans(self.policy)
 
