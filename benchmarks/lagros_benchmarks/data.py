@@ -169,7 +169,8 @@ def write_minari(
         extra = _record(flown, record, outside)
         # Under a hidden name, which Minari does not list, until the last byte is there.
         with tempfile.TemporaryDirectory(prefix=".export-", dir=folder) as staging:
-            with _datasets_path(Path(staging)):
+            # Minari joins a relative path to itself.
+            with _datasets_path(Path(staging).resolve()):
                 _create(identifier, env, settings, flown, extra)
             place = folder / identifier
             place.parent.mkdir(parents=True, exist_ok=True)

@@ -83,7 +83,7 @@ def export(
     except (ValueError, OSError) as error:
         fail(error)
     try:
-        data, found = _written(source, format_, cast("Tanh", tanh or TANHS[0]))
+        data, found, cost = _written(source, format_, cast("Tanh", tanh or TANHS[0]))
     except RuntimeError as error:
         fail(error, status=1)
     if isinstance(found, str):
@@ -99,21 +99,42 @@ def export(
     except OSError as error:
         fail(f"cannot write {path}: {error}")
     typer.echo(f"weights {source.file}, SHA-256 {source.digest}")
-    typer.echo(line)
+    for told in (line, *cost):
+        typer.echo(told)
     typer.echo(f"wrote {path} ({path.stat().st_size / 1e3:.0f} kB)")
 
 
-def _written(source: Source, format_: str, tanh: Tanh) -> tuple[str | bytes, Agreement | str]:
-    """Return the file's content and how it compares with NumPy, or why it was not compared."""
+def _written(
+    source: Source, format_: str, tanh: Tanh
+) -> tuple[str | bytes, Agreement | str, list[str]]:
+    """Return the file's content, how it compares with NumPy, or why not, and what it costs."""
     from lagros_policies.export import check
+    from lagros_policies.export.cost import PLAIN, c_time, onnx_time
     from lagros_policies.export.file import c_file, onnx_file
 
     if format_ == "c":
         text = c_file(source, tanh)
         if check.compiler() is None:
-            return text, "no C compiler (gcc, cc) is on the path"
-        return text, check.check_c(text, source)
+            return text, "no C compiler (gcc, cc) is on the path", []
+        found = check.check_c(text, source)
+        where = f"here, {Path(check.compiler() or 'cc').name} {' '.join(PLAIN)}"
+        return text, found, [_time(*c_time(text, source), where), *_bytes(text)]
     model = onnx_file(source)
     if not check.has_onnxruntime():
-        return model, f"ONNX Runtime is not installed ({check.INSTALL})"
-    return model, check.check_onnx(model, source)
+        return model, f"ONNX Runtime is not installed ({check.INSTALL})", []
+    found = check.check_onnx(model, source)
+    return model, found, [_time(*onnx_time(model, source), "here, ONNX Runtime, one thread")]
+
+
+def _time(ours: float, numpys: float, where: str) -> str:
+    return f"one call {1e9 * ours:.0f} ns, NumPy predict {1e9 * numpys:.0f} ns ({where})"
+
+
+def _bytes(text: str) -> list[str]:
+    """Return the line of the bytes; none where the tools that count them are others."""
+    from lagros_policies.export.cost import footprint
+
+    try:
+        return [str(footprint(text))]
+    except (FileNotFoundError, RuntimeError):
+        return []

@@ -11,10 +11,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
 import subprocess
 import sys
-import tempfile
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ import numpy as np  # noqa: E402
 from lagros_envs.files import write_atomic  # noqa: E402
 from lagros_policies.export import NAMES, SpacecraftSource, check, load_source  # noqa: E402
 from lagros_policies.export.c99 import TANHS  # noqa: E402
+from lagros_policies.export.cost import footprint  # noqa: E402
 from lagros_policies.export.file import c_file, onnx_file  # noqa: E402
 from lagros_policies.export.source import Source  # noqa: E402
 from lagros_policies.imitation.features import cartpole_features  # noqa: E402
@@ -80,7 +80,7 @@ def main() -> None:
                 candidates[name] = lambda _, policy=compiled: [
                     policy.answer(rows) for _ in range(REPEATS)
                 ]
-            sizes[name] = footprint(text, flags)
+            sizes[name] = asdict(footprint(text, flags))
     times = interleave(candidates, options.rounds)
     calls = {name: CALLS * (REPEATS if name in sizes else 1) for name in times}
     cpu = {name: np.asarray(taken.cpu_seconds) / calls[name] for name, taken in times.items()}
@@ -96,6 +96,12 @@ def main() -> None:
         }
         results.append(figures | sizes.get(name, {}))
     report(results, options.policy)
+    if isinstance(source, SpacecraftSource):
+        sensed = [
+            float(np.mean(np.sum(rows[:, source.layout.slices[f"{kind}_mask"]], axis=1)))
+            for kind in ("neighbour", "obstacle")
+        ]
+        print("On average {:.1f} neighbours and {:.1f} obstacles are sensed.".format(*sensed))
     if options.json:
         write_atomic(options.json, json.dumps(results, indent=1) + "\n")
 
@@ -122,41 +128,14 @@ def report(results: list[dict[str, Any]], policy: str) -> None:
     ).stdout.splitlines()[0]
     print(f"{policy}, one call, one thread; {version}; NumPy {np.__version__}")
     print(f"load {os.getloadavg()[0]:.1f}. Ratios: how many times as fast as NumPy's.\n")
-    print(f"{'':<52}{'ns':>7}{'wall':>7}{'predict':>9}{'bare':>7}{'text':>8}{'RAM':>5}{'stack':>7}")
+    print(f"{'':<52}{'ns':>7}{'wall':>7}{'predict':>9}{'bare':>7}{'code':>8}{'RAM':>5}{'stack':>7}")
     for row in results:
-        memory = (
-            f"{row['text']:>8}{row['data'] + row['bss']:>5}{row['stack']:>7}"
-            if "text" in row
-            else ""
-        )
+        memory = f"{row['code']:>8}{row['ram']:>5}{row['stack']:>7}" if "code" in row else ""
         print(
             f"{row['name']:<52}{row['ns_per_call']:>7.0f}{row['wall_ns_per_call']:>7.0f}"
             f"{row['times_as_fast_as_predict']:>9.1f}{row['times_as_fast_as_bare']:>7.1f}{memory}"
         )
-    print("\ntext: code and weights, of `size` [B]. RAM: data and bss [B]. stack: at most [B].")
-
-
-def footprint(text: str, flags: tuple[str, ...]) -> dict[str, int]:
-    """Return the bytes of text (code and constants), data, bss and, at most, stack.
-
-    Raises:
-        FileNotFoundError: There is no compiler or no `size`.
-    """
-    tool, size = check.compiler(), shutil.which("size")
-    if tool is None or size is None:
-        raise FileNotFoundError("needs gcc and size (binutils) on the path")
-    with tempfile.TemporaryDirectory() as folder:
-        code, built = Path(folder) / "policy.c", Path(folder) / "policy.o"
-        code.write_text(text)
-        subprocess.run(
-            [tool, *flags, "-fstack-usage", "-c", str(code), "-o", str(built)], check=True
-        )
-        done = subprocess.run([size, str(built)], capture_output=True, text=True, check=True)
-        numbers = [int(word) for word in done.stdout.splitlines()[1].split()[:3]]
-        usage = built.with_suffix(".su").read_text().splitlines()
-        # Sum of all functions: what a call could need were none inlined into another.
-        stack = sum(int(line.split("\t")[1]) for line in usage)
-    return dict(zip(("text", "data", "bss"), numbers, strict=True)) | {"stack": stack}
+    print("\ncode: with the weights, of `size` [B]. RAM: data and bss [B]. stack: at most [B].")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import socket
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -13,6 +14,8 @@ Outcome = TypeVar("Outcome")
 BACKENDS = ("loky", "ray", "dask")
 # How often a chunk may lose its worker: what kills so many (too little memory, say) will go on.
 ATTEMPTS = 4
+# How long a cluster may take to answer the first time [s].
+PATIENCE = 10.0
 
 _LOG = logging.getLogger(__name__)
 
@@ -81,3 +84,26 @@ def installed(module: str) -> Any:
         raise BackendError(
             f"the backend {extra} is not installed; pip install 'lagros[{extra}]'"
         ) from error
+
+
+def knock(address: str, speaks: bool) -> None:
+    """Raise at once where no cluster listens: Ray and Dask themselves go on asking, up to minutes.
+
+    Args:
+        address: host:port, or scheme://host:port.
+        speaks: Whether a cluster says something there before it is asked.
+
+    Raises:
+        ValueError: That is no such address.
+        OSError: Nothing listens there, or it says nothing.
+    """
+    host, colon, port = address.rpartition("//")[2].rpartition(":")
+    if not (colon and host and port.isdecimal()):
+        raise ValueError("it must be host:port")
+    with socket.create_connection((host.strip("[]"), int(port)), timeout=PATIENCE) as line:
+        try:
+            silent = speaks and not line.recv(1)
+        except TimeoutError:
+            silent = True
+    if silent:
+        raise OSError("what listens there is something else")

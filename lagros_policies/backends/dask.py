@@ -20,7 +20,7 @@ from typing import Any
 
 from joblib.externals.loky.backend.reduction import dumps, loads
 
-from lagros_policies.backends.base import BackendError, Item, Outcome, gave_up, installed
+from lagros_policies.backends.base import BackendError, Item, Outcome, gave_up, installed, knock
 
 # How often a process looks whether its last result was taken [s].
 _LOOK = 0.002
@@ -147,10 +147,24 @@ def connected(address: str | None, jobs: int) -> Iterator[Any]:
         else:
             place = address
         try:
+            if address is not None:
+                _knock(address)
             client = stack.enter_context(distributed.Client(place))
-        except (OSError, ValueError) as error:
-            raise BackendError(f"no Dask scheduler answers at {address!r}: {error}") from error
+        except Exception as error:  # of many classes, where something else listens
+            raise BackendError(
+                f"no Dask scheduler answers at {address!r} ({error}); start one with `dask "
+                "scheduler` and name it as tcp://host:8786 (not the dashboard), or leave the "
+                "address out to start workers on this machine"
+            ) from error
         yield client
+
+
+def _knock(address: str) -> None:
+    """Raise at once where no scheduler listens; of Dask's own transports only some have a port."""
+    scheme, colon, _ = address.rpartition("://")
+    if not colon or scheme in ("tcp", "tls"):
+        # A scheduler greets who connects; under TLS, it waits to be greeted.
+        knock(address, speaks=scheme != "tls")
 
 
 def _current(distributed: Any, address: str | None) -> Any:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import os
-import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -22,6 +21,7 @@ from lagros_policies.backends.base import (
     Outcome,
     gave_up,
     installed,
+    knock,
 )
 
 
@@ -99,10 +99,17 @@ def connected(address: str | None, jobs: int) -> Iterator[Any]:
         if address is None:
             _start(ray, num_cpus=jobs, **quiet)
         else:
-            _knock(address)
+            if ":" in address.rpartition("//")[2]:  # not "auto", which Ray looks up by itself
+                knock(address, speaks=True)
             ray.init(address=address, **quiet)
-    except (OSError, ValueError) as error:
-        raise BackendError(f"no Ray cluster answers at {address!r}: {error}") from error
+    except BackendError:
+        raise
+    except Exception as error:  # of many classes, where something else listens
+        raise BackendError(
+            f"no Ray cluster answers at {address!r} ({error}); start one with `ray start --head` "
+            "and name it as auto, host:6379 or ray://host:10001, with RAY_AUTH_MODE=token if it "
+            "has a token, or leave the address out to start workers on this machine"
+        ) from error
     try:
         yield ray
     finally:
@@ -122,10 +129,3 @@ def _start(ray: Any, **settings: Any) -> None:
                     f"Ray does not start ({error}); where the machine is busy, start it by hand "
                     "with `ray start --head` and name it with --address auto"
                 ) from error
-
-
-def _knock(address: str) -> None:
-    """Raise OSError at once where nothing listens: Ray itself goes on asking for minutes."""
-    host, colon, port = address.rpartition("//")[2].rpartition(":")
-    if colon:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=10.0).close()

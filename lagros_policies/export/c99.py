@@ -75,7 +75,9 @@ def _header(source: NetworkSource, name: str, tanh: Tanh) -> str:
  * initial_state  x(0) of the episode; only its position and angle are read
  * time           since the start of the episode [s]
  * observation    the four above in a row, as lagros/CartPole-v0 gives them
- * returns        the force on the cart [N], not saturated; hold it for one control step of 0.1 s
+ * returns        the force on the cart [N], not saturated; hold it for one control step of 0.1 s.
+ *                A NaN in any number that is read makes it NaN; compile without -ffast-math and
+ *                -Ofast, which take it that there is none
  *
  * Network: {shape}, tanh between the layers. tanh: {libm}.
  * Weights: {source.file}, SHA-256

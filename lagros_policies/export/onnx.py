@@ -31,16 +31,18 @@ def policy_model(source: NetworkSource) -> bytes:
         A model of input "observation", shape (batch, 13), that of lagros/CartPole-v0, and output
         "force", shape (batch, 1) [N]. The weights' name and digest are in its metadata.
     """
-    # Features of the right side are linear: their matrix is what they make of the unit vectors.
+    # A feature of the right side is a number of the observation, or the difference of two. (As the
+    # product with a matrix of ones and zeros, one infinite number would make all of them NaN.)
     features, _ = cartpole_features(np.eye(task.OBSERVATION_DIM, dtype=np.float32))
-    lean = np.zeros((task.OBSERVATION_DIM, 1), np.float32)
-    lean[task.INITIAL_STATE.start + ANGLE] = 1.0
+    lean = np.array([task.INITIAL_STATE.start + ANGLE])
     mirror = np.ones(len(FEATURES), np.float32)
     mirror[: FEATURES.index("time [s]")] = -1.0  # time has no side
     layers, tensors = _layers(source.network, "mirrored", "answer")
     tensors = [
-        tensor("features.matrix", features),
-        tensor("lean.vector", lean),
+        tensor("seen.columns", features.argmax(axis=0)),
+        tensor("origin.columns", features.argmin(axis=0)),
+        tensor("origin.counts", -features.min(axis=0)),
+        tensor("lean.column", lean),
         tensor("zero", np.zeros(1, np.float32)),
         tensor("one", np.ones(1, np.float32)),
         tensor("minus.one", -np.ones(1, np.float32)),
@@ -49,8 +51,12 @@ def policy_model(source: NetworkSource) -> bytes:
         *tensors,
     ]
     nodes = [
-        node("MatMul", ["observation", "features.matrix"], "features"),
-        node("MatMul", ["observation", "lean.vector"], "initial.angle"),
+        node("Gather", ["observation", "seen.columns"], "seen", axis=1),
+        node("Gather", ["observation", "origin.columns"], "beside", axis=1),
+        node("Greater", ["origin.counts", "zero"], "has.origin"),
+        node("Where", ["has.origin", "beside", "zero"], "origin"),
+        node("Sub", ["seen", "origin"], "features"),
+        node("Gather", ["observation", "lean.column"], "initial.angle", axis=1),
         node("Less", ["initial.angle", "zero"], "left"),
         node("Where", ["left", "left.signs", "right.signs"], "signs"),
         node("Mul", ["features", "signs"], "mirrored"),

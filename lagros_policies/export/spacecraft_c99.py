@@ -68,7 +68,8 @@ def _header(source: SpacecraftSource, name: str) -> str:
  * obstacles    three for each that is sensed: centre x, y relative to the agent [m], radius [m]
  * observation  as lagros/Spacecraft-v0 gives it, 9 + 5 neighbour_slots + 4 obstacle_slots numbers
  * thrust       written: u >= 0 of the eight thrusters [N]; hold it for one control step of 0.1 s.
- *              Any NaN among the numbers of what is sensed makes all eight NaN
+ *              A NaN in any number that is read, a mask included, makes all eight NaN; compile
+ *              without -ffast-math and -Ofast, which take it that there is none
  *
  * Bodies that would not be sensed have no influence: agents whose centre, and obstacles of which
  * every part, is farther than REACH. No safety filter is included.
@@ -277,12 +278,17 @@ void {name}_observation(const float *observation, int neighbour_slots,
     struct view view;
     int i;
     look(observation, &view);
+    /* Zero times the mask: a NaN there must not hide a body. */
     for (i = 0; i < neighbour_slots; i++)
         if (neighbour_mask[i] > 0.0f)
             see_neighbour(&view, neighbours + 4 * i);
+        else
+            view.inputs[OWN] += 0.0f * neighbour_mask[i];
     for (i = 0; i < obstacle_slots; i++)
         if (obstacle_mask[i] > 0.0f)
             see_obstacle(&view, obstacles + 3 * i);
+        else
+            view.inputs[OWN] += 0.0f * obstacle_mask[i];
     answer(&view, observation, thrust);
 }}
 """

@@ -222,7 +222,9 @@ def _pooled(
     mask = graph.part(
         "observation", layout.slices[f"{kind}_mask"], (getattr(layout, f"{kind}s"), 1)
     )
-    sensed = graph.do("Where", graph.do("Greater", mask, 0.0), weight, 0.0)
+    # Zero times the mask: a NaN there must not hide a body.
+    absent = graph.do("Mul", mask, 0.0)
+    sensed = graph.do("Where", graph.do("Greater", mask, 0.0), weight, absent)
     weighted = graph.do("Mul", graph.layers(values, source.network.layers[kind]), sensed)
     return graph.do("ReduceSum", weighted, graph.constant([_SLOT]), keepdims=1)
 

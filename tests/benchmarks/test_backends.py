@@ -7,8 +7,10 @@ import itertools
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -24,7 +26,16 @@ from lagros_benchmarks.reproduce import ReproduceSettings
 from lagros_benchmarks.reproduction import reproduce
 from lagros_benchmarks.runner import run_benchmark
 from lagros_benchmarks.settings import BenchmarkSettings
-from lagros_policies.backends import ATTEMPTS, LOKY, Backend, BackendError, each, running
+from lagros_policies.backends import (
+    ATTEMPTS,
+    LOKY,
+    Backend,
+    BackendError,
+    base,
+    dask,
+    each,
+    running,
+)
 from lagros_policies.backends import loky as processes
 from lagros_policies.contraction import load_metric
 from lagros_policies.imitation.dataset import ExpertDataSettings, generate
@@ -309,6 +320,24 @@ def test_what_is_finished_and_not_yet_asked_for_outlives_its_worker(place, tmp_p
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("place", ["dask"], indirect=True)
+def test_a_worker_of_dask_keeps_no_result_while_it_works(place, tmp_path, monkeypatch):
+    take, may_take = dask._take, threading.Event()
+    monkeypatch.setattr(dask, "_take", lambda *both: may_take.wait() and take(*both))
+    work, out = fragile.Fragile(tmp_path, lasting=0.0), {}
+    asking = threading.Thread(target=lambda: out.update(each(work, range(9), JOBS, place)))
+    asking.start()
+    try:
+        wait_until(lambda: len(work.log()) >= JOBS)
+        time.sleep(0.5)
+        assert len(work.log()) == JOBS
+    finally:
+        may_take.set()
+        asking.join()
+    assert out == {number: number**2 for number in range(9)}
+
+
+@pytest.mark.slow
 def test_a_chunk_that_kills_every_worker_ends_the_run(place, tmp_path):
     work = fragile.Fragile(tmp_path, deadly=1, deaths=100)
     with pytest.raises(BackendError, match=f"lost its worker {ATTEMPTS} times"):
@@ -401,14 +430,73 @@ def test_without_an_address_workers_are_started_and_stopped(name):
     assert out == dict(enumerate(range(5, 9)))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "nowhere:x"])
-def test_an_address_without_a_cluster_is_named(address, monkeypatch):
-    for name, module in (("ray", "ray"), ("dask", "distributed")):
-        found = pytest.importorskip(module, reason=f"the extra `{name}` is not installed")
-        if name == "ray":
-            # It may be connected already, for other tests.
-            monkeypatch.setattr(found, "is_initialized", lambda: False)
-        if name == "ray" or "//" not in address:
-            with pytest.raises(BackendError, match=f"no {name.title()} .* answers at '{address}'"):
-                list(each(str, [1], 1, Backend(name, address)))
+@pytest.fixture(scope="module")
+def mute():
+    """The port of something that lets connect and says nothing, as a server of web pages does."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        yield listening.getsockname()[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "address", "why"),
+    [
+        ("ray", "127.0.0.1:1", "refused"),
+        ("ray", "ray://127.0.0.1:1", "refused"),
+        ("ray", "nowhere:x", "must be host:port"),
+        ("ray", "127.0.0.1:MUTE", "something else"),
+        ("dask", "127.0.0.1:1", "refused"),
+        ("dask", "tcp://127.0.0.1:1", "refused"),
+        ("dask", "tls://127.0.0.1:1", "refused"),
+        ("dask", "nowhere:x", "must be host:port"),
+        ("dask", "auto", "must be host:port"),
+        ("dask", "carrier-pigeon://127.0.0.1:1", "unknown address scheme"),
+        ("dask", "127.0.0.1:MUTE", "something else"),
+    ],
+)
+def test_an_address_without_a_cluster_is_named_at_once(name, address, why, mute, monkeypatch):
+    # Dask would go on asking for 30 s, Ray for minutes: neither is asked.
+    disconnected(name, monkeypatch, refuse_to_ask)
+    monkeypatch.setattr(base, "PATIENCE", 0.3)
+    address = address.replace("MUTE", str(mute))
+    wanted = rf"no {name.title()} .* answers at '{address}' \(.*{why}.*leave the address out"
+    with pytest.raises(BackendError, match=wanted):
+        list(each(str, [1], 1, Backend(name, address)))
+
+
+def disconnected(name, monkeypatch, connect):
+    """Make a library, which may be connected already for other tests, connect by this function."""
+    module = {"ray": "ray", "dask": "distributed"}[name]
+    found = pytest.importorskip(module, reason=f"the extra `{name}` is not installed")
+    if name == "ray":
+        monkeypatch.setattr(found, "is_initialized", lambda: False)
+        monkeypatch.setattr(found, "init", connect)
+    else:
+        monkeypatch.setattr("lagros_policies.backends.dask._current", lambda *_: None)
+        monkeypatch.setattr(found, "Client", connect)
+
+
+def refuse_to_ask(address, **_):
+    if "pigeon" in address:
+        raise ValueError("unknown address scheme")
+    raise AssertionError("asked")
+
+
+@pytest.mark.parametrize("name", ["ray", "dask"])
+def test_whatever_is_raised_where_no_cluster_answers_is_told(name, monkeypatch):
+    """Dask takes the bytes of another service for the length of a message, of exabytes."""
+
+    def connect(address, **_):
+        raise MemoryError("3.07 EiB")
+
+    def speak(listening):
+        with listening.accept()[0] as line:
+            line.sendall(b"SSH")
+
+    disconnected(name, monkeypatch, connect)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        speaking = threading.Thread(target=speak, args=(listening,))
+        speaking.start()
+        address = f"127.0.0.1:{listening.getsockname()[1]}"
+        with pytest.raises(BackendError, match=rf"answers at '{address}' \(3.07 EiB\)"):
+            list(each(str, [1], 1, Backend(name, address)))
+        speaking.join()

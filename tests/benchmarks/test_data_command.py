@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 import lagros_envs
 from lagros_benchmarks import cli, data
 from lagros_envs.seeding import EVALUATION, episode_seeds
+from lagros_policies.centralized import CentralizedPolicy
 from lagros_policies.imitation.demonstrations import DemonstrationSettings, demonstrate
 
 minari = pytest.importorskip("minari")
@@ -135,6 +136,44 @@ def test_a_reader_who_imports_minari_alone_recovers_the_environment(exported):
         check=False,
     )
     assert read.stdout == "sinusoid 0.6\n", read.stderr
+
+
+def test_the_default_folder_is_below_the_current_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = export("--minari", "--episodes", "1")
+    assert result.exit_code == 0, result.output
+    monkeypatch.setenv("MINARI_DATASETS_PATH", "runs/minari")
+    (episode,) = minari.load_dataset(IDENTIFIER).iterate_episodes()
+    assert len(episode) == 90
+    assert [path.name for path in (tmp_path / "runs" / "minari").iterdir()] == ["lagros"]
+
+
+@pytest.mark.slow
+def test_the_spacecraft_is_read_back_with_its_metric_and_repeats(tmp_path, monkeypatch):
+    result = export("--minari", "--task", "spacecraft", "--episodes", "1", "--out", str(tmp_path))
+    assert result.exit_code == 0, result.output
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    dataset = minari.load_dataset("lagros/spacecraft/expert-v0")
+    record = dataset.storage.metadata["lagros"]
+    for axis in ("plane", "turning"):
+        tracking = make_tracking(axis)
+        assert record["metric"][axis]["alpha"] == tracking.rate
+        np.testing.assert_array_equal(record["metric"][axis]["dual"], tracking.dual)
+    assert record["planner"]["control_period"] == 0.1
+    (about,) = dataset.storage.get_episode_metadata([0])
+    (episode,) = dataset.iterate_episodes()
+    env = dataset.recover_environment()
+    observation, _ = env.reset(seed=about["seed"])
+    for step, action in enumerate(episode.actions):
+        np.testing.assert_array_equal(observation, episode.observations[step])
+        observation, reward, *_ = env.step(action)
+        assert reward == episode.rewards[step]
+    np.testing.assert_array_equal(observation, episode.observations[-1])
+
+
+def make_tracking(axis):
+    settings = gym.make("lagros/Spacecraft-v0").unwrapped.settings
+    return getattr(CentralizedPolicy(settings, num_agents=1).tracking, axis)
 
 
 def test_a_dataset_that_is_there_is_never_written_over(exported, grounded):

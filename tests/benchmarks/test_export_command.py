@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
+import shutil
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from lagros_benchmarks import cli
 from lagros_policies.export import check, load_source
+from lagros_policies.export.cost import footprint
 from lagros_policies.export.source import example_observations
 from lagros_policies.imitation.networks import Mlp
 
@@ -31,6 +35,51 @@ def test_c_is_written_under_the_name_of_the_policy(invoke, tmp_path):
     rows = example_observations(50)
     with check.CompiledPolicy(text, source) as compiled:
         np.testing.assert_allclose(compiled.force(rows), source.force(rows), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
+@pytest.mark.skipif(shutil.which("size") is None, reason="no binutils")
+@pytest.mark.parametrize("policy", ["lagros-cartpole", "lagros-spacecraft"])
+def test_time_and_bytes_of_c_are_told(invoke, tmp_path, policy):
+    told = invoke(policy).stdout
+    ours, numpys = map(int, re.search(r"one call (\d+) ns, NumPy predict (\d+) ns", told).groups())
+    assert 0 < ours < 1e6
+    assert 0 < numpys < 1e9
+    code, ram, stack = map(
+        int, re.search(r"weights (\d+) B, RAM (\d+) B, stack at most (\d+) B", told).groups()
+    )
+    network = load_source(policy).network
+    parts = (
+        [network.weights, network.biases]
+        if policy == "lagros-cartpole"
+        else [array for layers in network.layers.values() for array in zip(*layers, strict=True)]
+    )
+    weights = sum(array.nbytes for arrays in parts for array in arrays)
+    assert weights < code < weights + 10_000
+    assert ram == 0
+    assert 400 < stack < 20_000
+
+
+@pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
+@pytest.mark.skipif(shutil.which("size") is None, reason="no binutils")
+def test_bytes_are_those_of_the_file():
+    kept = "static const float weights[100] = {1.0f};\nstatic float last[25];\n"
+    text = kept + "float f(int i);\nfloat f(int i) { return last[i] += weights[i]; }\n"
+    found = footprint(text)
+    assert found.ram == 100
+    assert 400 <= found.code < 600
+    with pytest.raises(RuntimeError, match="do not tell the bytes"):
+        footprint("float f(")
+
+
+@pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
+def test_where_nobody_counts_bytes_the_rest_is_told(invoke, monkeypatch):
+    found = shutil.which
+    monkeypatch.setattr(shutil, "which", lambda name: None if name == "size" else found(name))
+    result = invoke("lagros-cartpole")
+    assert result.exit_code == 0, result.output
+    assert "ns, NumPy predict" in result.stdout
+    assert "RAM" not in result.stdout
 
 
 @pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
@@ -62,6 +111,7 @@ def test_onnx_of_the_spacecraft_takes_the_observation_of_so_many_agents(invoke, 
     rows = source.examples(50, seed=2)
     forces = check.onnx_answer((tmp_path / "learned_spacecraft.onnx").read_bytes(), rows)
     assert check.agreement(forces, source, rows).relative < 1e-6
+    assert re.search(r"one call \d+ ns, NumPy predict \d+ ns \(here, ONNX", result.stdout)
 
 
 @pytest.mark.skipif(not check.has_onnxruntime(), reason="no onnxruntime")
@@ -96,6 +146,7 @@ def test_what_cannot_be_compared_is_written_and_said(invoke, tmp_path, monkeypat
 def test_a_file_that_disagrees_is_not_written(invoke, tmp_path, monkeypatch, difference):
     monkeypatch.setattr(check, "compiler", lambda: "gcc")
     monkeypatch.setattr(check, "check_c", lambda *_: check.Agreement(difference, 30.0))
+    monkeypatch.setattr("lagros_policies.export.cost.c_time", lambda *_: (1e-6, 1e-6))
     result = invoke("lagros-cartpole")
     assert result.exit_code == 1
     assert "not written" in result.stderr

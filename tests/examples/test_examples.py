@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from lagros_policies.export import check as check_export
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -52,6 +55,22 @@ def test_every_example_is_tested_and_says_how_it_is_run():
     for name in names:
         assert f"python examples/{name}.py" in (EXAMPLES / f"{name}.py").read_text()
         assert f"examples/{name}.py" in guide
+
+
+# What tests all over the project are skipped without; the extra `all` brings it.
+WANTED = ("onnxruntime", "ray.rllib", "distributed", "minari", "pyarrow", "skrl", "torchrl")
+INSTALLED = "CI" in os.environ or (Path(sys.prefix) / ".lagros-installed").exists()
+
+
+@pytest.mark.skipif(not INSTALLED, reason="not installed by `make install`")
+@pytest.mark.parametrize("module", WANTED)
+def test_where_everything_was_installed_no_test_is_skipped_for_want_of_it(module):
+    assert importlib.util.find_spec(module) is not None
+
+
+@pytest.mark.skipif(not INSTALLED, reason="not installed by `make install`")
+def test_where_everything_was_installed_exported_c_is_compiled():
+    assert check_export.compiler() is not None
 
 
 def test_cleanrl_style_ppo(example, capsys):

@@ -132,6 +132,69 @@ def test_onnx_equals_numpy(name, observations):
     assert check.onnx_force(model, observations[:1])[0] == pytest.approx(forces[0], rel=1e-5)
 
 
+# What u_L reads of an observation: the rest of the goal and of the start are not used.
+READ = (0, 1, 2, 3, 4, 8, 9, 12)
+
+
+def spoiled(value):
+    """One observation for each of its numbers, which has this value there."""
+    rows = np.repeat(example_observations(1, seed=3), 13, axis=0)
+    np.fill_diagonal(rows, value)
+    return rows
+
+
+@pytest.fixture(params=["c", "onnx"])
+def exported(request):
+    """The shipped policy and its export as a function."""
+    source = load_source("lagros-cartpole")
+    if request.param == "onnx":
+        pytest.importorskip("onnxruntime")
+        yield source, lambda rows: check.onnx_force(policy_model(source), rows)
+        return
+    if check.compiler() is None:
+        pytest.skip("no C compiler")
+    with check.CompiledPolicy(c_source(source), source) as compiled:
+        yield source, compiled.force
+
+
+def test_nan_where_it_is_read_and_nowhere_else(exported):
+    _, force = exported
+    assert tuple(np.flatnonzero(np.isnan(force(spoiled(np.nan))))) == READ
+
+
+@pytest.mark.parametrize("value", [np.inf, -np.inf, 3e38, -3e38, 1e-45])
+def test_infinite_and_extreme_numbers_as_in_numpy(exported, value):
+    source, force = exported
+    rows = spoiled(value)
+    with np.errstate(all="ignore"):
+        wanted = source.force(rows)
+    # Two infinities of opposite sign, of the goal in two features, may meet in the first layer.
+    assert set(np.flatnonzero(np.isnan(wanted))) <= {4}
+    np.testing.assert_allclose(force(rows), wanted, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [3.0, 10.0, 100.0, 1e3, 1e4, 1e10, 1e30])
+def test_far_outside_of_what_was_trained_no_worse_than_numpy(exported, scale):
+    source, force = exported
+    rows = (example_observations(500, seed=7) * np.float32(scale)).astype(np.float32)
+    exact, wanted = by_hand(source.network, rows), source.force(rows)
+    largest = np.max(np.abs(exact))
+    # Pre-activations of this size have no more digits than float32 leaves them.
+    rounding = np.max(np.abs(wanted - exact)) / largest
+    assert np.max(np.abs(force(rows) - exact)) / largest <= 1e-6 + 3.0 * rounding
+    assert rounding < 1e-4
+
+
+def test_near_the_force_itself_where_it_exceeds_a_newton(exported):
+    source, force = exported
+    rows = example_observations(5000)
+    wanted = source.force(rows)
+    large = np.abs(wanted) > 1.0
+    assert np.mean(large) > 0.8
+    np.testing.assert_allclose(force(rows)[large], wanted[large], rtol=5e-6)
+    np.testing.assert_allclose(wanted[large], by_hand(source.network, rows)[large], rtol=5e-6)
+
+
 @needs_onnx
 def test_onnx_ports_and_provenance():
     import onnxruntime

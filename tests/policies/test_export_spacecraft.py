@@ -190,6 +190,43 @@ def test_no_nan_is_lost_in_c(called):
             assert np.all(np.isnan(function.thrust(*spoiled))), (part, place)
 
 
+@pytest.mark.parametrize("kind", ["c", "onnx"])
+def test_no_nan_of_the_flat_observation_is_lost(kind):
+    source = load_source("lagros-spacecraft", num_agents=3)
+    at = source.layout.slices
+    rows = source.examples(50, seed=4)
+    seen = rows[:, [*range(*at["neighbour_mask"].indices(99)), at["obstacle_mask"].start]]
+    row = rows[np.argmax(np.sum(seen, axis=1))]
+    assert np.all(row[at["neighbour_mask"]] == 1.0)
+    assert 0.0 < np.mean(row[at["obstacle_mask"]]) < 1.0
+    spoiled = np.repeat(row[None], len(row), axis=0)
+    np.fill_diagonal(spoiled, np.nan)
+    if kind == "onnx":
+        pytest.importorskip("onnxruntime")
+        forces = check.onnx_answer(onnx_file(source), spoiled)
+    elif check.compiler() is None:
+        pytest.skip("no C compiler")
+    else:
+        with check.CompiledPolicy(c_file(source), source) as compiled:
+            forces = compiled.answer(spoiled)
+    # A slot that is empty is not read by C; its mask is.
+    read = np.ones(len(row), bool)
+    if kind == "c":
+        read[at["obstacles"]] = np.repeat(row[at["obstacle_mask"]] > 0.0, 3)
+    np.testing.assert_array_equal(np.isnan(forces), np.repeat(read[:, None], 8, axis=1))
+
+
+@needs_onnx
+@pytest.mark.parametrize("part", ["goal", "velocity", "spin", "time"])
+@pytest.mark.parametrize("scale", [0.0, 1e-6, 10.0, 1e3, 1e6, 1e12])
+def test_onnx_equals_numpy_far_outside_of_what_was_trained(part, scale):
+    source = load_source("lagros-spacecraft", num_agents=3)
+    rows = source.examples(300, seed=5)
+    rows[:, source.layout.slices[part]] *= np.float32(scale)
+    found = check.agreement(check.onnx_answer(onnx_file(source), rows), source, rows)
+    assert found.relative < 2e-6
+
+
 @needs_compiler
 @pytest.mark.parametrize(
     "widths",
