@@ -26,9 +26,9 @@ class Correction(ActorPolicy):
 class ResidualPolicy:
     """The force of LAG-ROS plus a correction that reinforcement learning has trained.
 
-    The bound of Theorem 1 holds for u_L with the learning error eps_l. A correction of at most beta
-    is a further error of u: the bound of the sum is that of eps_l + beta, whatever was learned. It
-    is looser, and nothing else is known about the correction.
+    A correction of at most beta enters Theorem 1 as a learning error does: where its bound holds
+    for u_L with the learning error eps_l, that of the sum has eps_l + beta in its place, whatever
+    was learned. It is looser, and nothing else is known about the correction.
 
     Args:
         settings: The task; None for the paper's.

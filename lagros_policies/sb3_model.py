@@ -1,4 +1,4 @@
-"""Models of stable-baselines3 as policies of the cart-pole, loaded only where a user names one."""
+"""Models of stable-baselines3 as policies, loaded only where a user names one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs import cartpole_task as task
+from lagros_envs import cartpole_task, spacecraft_task
+from lagros_envs.observation import Layout
+from lagros_envs.scenarios import Preset, preset_named
 
 Float32Array = NDArray[np.float32]
 
@@ -22,24 +24,27 @@ class StableBaselines3Policy:
     """A stable-baselines3 model with the interface and the checks of this package.
 
     Args:
-        model: The model; its observation must be the 13 numbers of the cart-pole task, its action
-            one number.
+        model: The model. For the cart-pole its observation is the 13 numbers of the task and its
+            action one number; for spacecraft they are those of one agent, which all agents share.
         name: Name in tables.
+        preset: Preset (or its name) of the worlds of spacecraft, with the number of their agents;
+            None for the cart-pole.
 
     Raises:
-        ValueError: The model was trained on other spaces.
+        ValueError: The model was trained on other spaces, or there is no such preset.
     """
 
     observes: Literal["local", "global"] = "local"
 
-    def __init__(self, model: Any, name: str) -> None:
+    def __init__(self, model: Any, name: str, preset: str | Preset | None = None) -> None:
         """Wrap the model; see the class for the arguments."""
         spaces = model.observation_space.shape, model.action_space.shape
-        if spaces != ((task.OBSERVATION_DIM,), (1,)):
+        expected, where = _expected(None if preset is None else preset_named(preset))
+        if spaces != expected:
             raise ValueError(
                 f"{name} was trained on observations of shape {spaces[0]} and actions of shape "
-                f"{spaces[1]}; lagros/CartPole-v0 has ({task.OBSERVATION_DIM},) and (1,). A model "
-                "that was trained behind wrappers cannot be used without them"
+                f"{spaces[1]}; {where} {expected[0]} and {expected[1]}. A model that was trained "
+                "behind wrappers cannot be used without them"
             )
         self.name = name
         self.model = model
@@ -58,8 +63,20 @@ class StableBaselines3Policy:
         return np.asarray(action, np.float32), state
 
 
+def _expected(preset: Preset | None) -> tuple[tuple[tuple[int, ...], tuple[int, ...]], str]:
+    """Return the shapes of observation and action, and whose they are, for a message."""
+    if preset is None:
+        return ((cartpole_task.OBSERVATION_DIM,), (1,)), "lagros/CartPole-v0 has"
+    layout = Layout.for_preset(preset, spacecraft_task.SpacecraftSettings())
+    where = (
+        f"worlds of {preset.agents} agents and at most {preset.obstacle_count[1]} obstacles, for "
+        "which it must be trained, have"
+    )
+    return ((layout.size,), (spacecraft_task.THRUSTERS,)), where
+
+
 def load_stable_baselines3(
-    path: Path | str, algorithm: str | None = None
+    path: Path | str, algorithm: str | None = None, preset: str | Preset | None = None
 ) -> StableBaselines3Policy:
     """Load a model saved by stable-baselines3's `model.save(path)`.
 
@@ -70,6 +87,7 @@ def load_stable_baselines3(
     Args:
         path: The zip file.
         algorithm: One of `ALGORITHMS`, in any case; None to detect it.
+        preset: Of the worlds of spacecraft; None for a model of the cart-pole.
 
     Returns:
         The policy, on the CPU, named after the file.
@@ -99,7 +117,7 @@ def load_stable_baselines3(
             f"{path} could not be loaded as a {chosen} model of stable-baselines3 "
             f"{library.__version__} ({type(error).__name__}: {error})"
         ) from error
-    return StableBaselines3Policy(model, path.stem)
+    return StableBaselines3Policy(model, path.stem, preset)
 
 
 def detect_algorithm(path: Path | str) -> str:

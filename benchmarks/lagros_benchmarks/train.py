@@ -74,6 +74,9 @@ def train(
         seeds = listed(seed, int, "--seed")
         if not names or not seeds:
             raise ValueError("--algo and --seed must not be empty")
+        for option, values in (("--algo", names), ("--seed", seeds)):
+            if len(set(values)) < len(values):
+                raise ValueError(f"{option} names a run twice; give each once")
         if parallel_env and task != "spacecraft":
             raise ValueError(f"--parallel-env is for spacecraft; leave it out for {task}")
         if residual is not None and task != "cartpole":

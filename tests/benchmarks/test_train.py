@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,13 +18,17 @@ import pytest
 pytest.importorskip("stable_baselines3")
 
 import torch
+from stable_baselines3.common.vec_env import VecNormalize
 from typer.testing import CliRunner
 
+from lagros_benchmarks import canvas
 from lagros_benchmarks import train as command
 from lagros_benchmarks.cli import app
 from lagros_benchmarks.sb3_vector import SB3VectorEnv
 from lagros_benchmarks.settings import BenchmarkSettings
 from lagros_benchmarks.training import cartpole
+from lagros_benchmarks.training import curves as curves_module
+from lagros_benchmarks.training.agent import make_agent
 from lagros_benchmarks.training.curves import curves_of, draw, range_confidence
 from lagros_benchmarks.training.lessons import lesson_of
 from lagros_benchmarks.training.run import Place, train
@@ -39,12 +45,17 @@ from lagros_benchmarks.training.settings import (
     Training,
     default_training,
 )
+from lagros_envs.cartpole import CartPoleEnv
 from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.cartpole_vector import CartPoleVectorEnv
 from lagros_envs.seeding import EVALUATION, episode_seeds
 from lagros_policies.actor import Actor, ActorPolicy
 from lagros_policies.imitation.networks import Mlp
 from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.policy import make
+from lagros_policies.residual import ResidualPolicy
+
+ROOT = Path(__file__).parents[2]
 
 BUFFER = {"batch_size": 32, "gradient_steps": 3, "warm_up": 64, "hidden": (8,)}
 ALGORITHMS = {
@@ -85,6 +96,7 @@ def run(training, folder, **options):
         {"segments": 1 << 16},
         {"worlds": 1.5},
         {"seed": -1},
+        {"seed": 1 << 32},
         {"segment_steps": 13},
         {"largest_correction": 0.0},
         {"largest_correction": float("inf")},
@@ -133,6 +145,110 @@ def test_no_episode_of_training_or_its_figures_is_one_of_the_benchmark():
     assert len(starts) == 1003
 
 
+def test_the_figures_are_of_episodes_that_neither_training_nor_the_benchmark_meets(monkeypatch):
+    training = replace(TINY, curve_episodes=40, final_episodes=50)
+    lesson = cartpole.CartPoleLesson(training)
+    flown = []
+
+    def spy(policy, seeds, *condition):
+        flown.append((seeds, *condition))
+        return {"success": 0.8}
+
+    monkeypatch.setattr(cartpole, "evaluate", spy)
+    model = make_agent(training, lesson.venv)
+    lesson.figures(model)
+    rows = lesson.final(model)
+    curve, final = episode_seeds(0, 40, CURVE), episode_seeds(0, 50, FINAL)
+    assert flown == [(curve, "uniform", 0.75), (final, "none", 0.0), (final, "uniform", 0.75)]
+    # Wilson's interval of 40 of 50.
+    assert rows[1]["success_ci95"] == [0.6696, 0.8876]
+
+
+@pytest.mark.parametrize("correction", [None, 4.0])
+@pytest.mark.parametrize("name", ["ppo", "td3"])
+def test_the_worlds_in_training_are_those_of_the_settings(name, correction):
+    algorithm = replace(ALGORITHMS[name], discount=0.97)
+    task = {"effort_weight": 0.7, "disturbance": "sphere", "disturbance_bound": 0.3}
+    training = replace(TINY, algorithm=algorithm, largest_correction=correction, **task)
+    venv = cartpole.CartPoleLesson(training).venv
+    disturbance, settings = venv.get_attr("disturbance")[0], venv.get_attr("settings")[0]
+    assert (disturbance.kind, disturbance.bound) == ("sphere", 0.3)
+    assert settings == CartPoleSettings(effort_weight=0.7)
+    assert venv.num_envs == training.worlds
+    # Returns are normalised over the agent's own horizon; those of a buffer are not.
+    assert getattr(venv, "gamma", None) == (0.97 if name == "ppo" else None)
+
+
+def test_the_agent_has_the_hyperparameters_of_the_settings():
+    made = {}
+    for name, change in (
+        ("ppo", {"gae_decay": 0.9, "clip_range": 0.3, "initial_log_std": -1.2}),
+        ("sac", {"averaging": 0.03, "initial_entropy_weight": 0.2}),
+        ("td3", {"averaging": 0.04, "action_noise": 0.3, "policy_delay": 3}),
+    ):
+        algorithm = replace(ALGORITHMS[name], **change)
+        training = replace(TINY, algorithm=algorithm, seed=5)
+        model = made[name] = make_agent(training, cartpole.CartPoleLesson(training).venv)
+        assert (model.gamma, model.seed) == (algorithm.discount, 5)
+        assert model.batch_size == algorithm.batch_size
+        assert [len(bias) for bias in cartpole.actor_network(model).biases] == [8, 1]
+        if isinstance(algorithm, OffPolicy):
+            assert model.replay_buffer.buffer_size == algorithm.buffer_size // TINY.worlds
+            assert (model.learning_starts, model.gradient_steps) == (64, 3)
+            assert model.tau == algorithm.averaging
+    ppo, sac, td3 = made.values()
+    assert (ppo.n_steps, ppo.n_epochs, ppo.gae_lambda) == (12, 2, 0.9)
+    assert ppo.clip_range(1.0) == 0.3
+    assert ppo.policy.log_std.item() == pytest.approx(-1.2)
+    assert sac.log_ent_coef.exp().item() == pytest.approx(0.2)
+    assert td3.policy_delay == 3
+    assert np.std([td3.action_noise()[0] for _ in range(4000)]) == pytest.approx(0.3, rel=0.05)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_what_is_kept_of_a_correction_is_what_flew_in_training(name, tmp_path):
+    training = replace(TINY, algorithm=ALGORITHMS[name], largest_correction=3.0)
+    lesson = cartpole.CartPoleLesson(training)
+    if isinstance(lesson.venv, VecNormalize):
+        lesson.venv.training = False  # the running mean is fixed at the export
+    model = make_agent(training, lesson.venv)
+    lesson.save(model, tmp_path / "a.safetensors")
+    policy = ResidualPolicy(weights=tmp_path / "a.safetensors")
+    assert policy.largest_correction == 3.0
+    applied = []
+    worlds = lesson.venv.unwrapped
+    while not isinstance(worlds, SB3VectorEnv):
+        worlds = worlds.venv
+    step = worlds.step_async
+    worlds.step_async = lambda actions: applied.append(np.array(actions)) or step(actions)
+    lesson.venv.seed(1)
+    seen = lesson.venv.reset()
+    flown = CartPoleVectorEnv(TINY.worlds, "uniform", autoreset_mode="same_step")
+    rows, _ = flown.reset(seed=1)
+    for _ in range(5):
+        seen, *_ = lesson.venv.step(model.predict(seen, deterministic=True)[0])
+        expected = policy.predict(rows)[0]
+        np.testing.assert_allclose(applied[-1], expected, atol=2e-5)
+        rows, *_ = flown.step(expected)
+    # No agent that did nothing would pass.
+    assert np.abs(applied[-1] - LagrosPolicy().predict(rows)[0]).max() > 1e-4
+
+
+def test_the_learning_rate_falls_by_segments_to_a_tenth(tmp_path, monkeypatch):
+    models = []
+
+    def keep(training, venv):
+        models.append(make_agent(training, venv))
+        return models[-1]
+
+    monkeypatch.setattr("lagros_benchmarks.training.run.make_agent", keep)
+    rates = [TINY.learning_rate(segment) for segment in range(3)]
+    np.testing.assert_allclose(rates, [3e-4, 2.1e-4, 1.2e-4])
+    assert replace(TINY, segments=1000).learning_rate(999) == pytest.approx(3e-5, rel=0.01)
+    run(TINY, tmp_path)
+    assert models[0].policy.optimizer.param_groups[0]["lr"] == rates[-1]
+
+
 # Runs
 
 
@@ -175,13 +291,17 @@ def test_the_folder_of_another_run_is_refused(tmp_path, monkeypatch):
     with pytest.raises(pytest.fail.Exception):
         run(TINY, folder)
     other = replace(TINY, seed=1)
-    with pytest.raises(ValueError, match="belongs to another run"):
+    differs = r"holds another run \(seed is 0 there and 1 here\)"
+    with pytest.raises(ValueError, match=differs):
         run(other, folder)
     checkpoint = folder / "checkpoint.pt"
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
     with pytest.raises(ValueError, match="is damaged"):
         run(TINY, folder)
-    (folder / "record.json").write_text('{"training": {}}')
+    (folder / "record.json").write_text(json.dumps({"training": other.record()}))
+    with pytest.raises(ValueError, match=r"seed is 1 there and 0 here\); delete it"):
+        run(TINY, folder)
+    (folder / "record.json").write_text('{"training": []}')
     with pytest.raises(ValueError, match="holds another run"):
         run(TINY, folder)
     (folder / "record.json").write_text("{")
@@ -314,13 +434,43 @@ def test_the_figures_count_what_happens_before_the_first_fall():
     assert figures["success"] < 0.5
 
 
+def test_the_class_in_the_documentation_is_a_row_of_the_benchmark(tmp_path, monkeypatch):
+    page = (ROOT / "docs" / "baselines.md").read_text()
+    blocks = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    plain, normalised, agent = (
+        next(block for block in blocks if word in block)
+        for word in ('model.save("ppo.zip")', "np.savez", "class Mine")
+    )
+    # The imports and the worlds of the first, the training of the second, cut short.
+    head = plain[: plain.index("model = PPO(")]
+    program = (head + normalised).replace("350_000", "64").replace("n_steps=90", "n_steps=1")
+    program = program.replace("batch_size=1440", "batch_size=64")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    names: dict[str, object] = {}
+    exec(program, names)
+    (tmp_path / "my_agent.py").write_text(agent)
+    out = ["--episodes", "1", "--timing-episodes", "1", "--json", "rows.json"]
+    given = ["bench", "cartpole", "--policies", "my_agent:Mine", *out]
+    result = CliRunner().invoke(app, given)
+    assert result.exit_code == 0, result.output
+    assert json.loads((tmp_path / "rows.json").read_text())[0]["errors"] == []
+    # It sees what the agent saw in its training.
+    observation = np.random.default_rng(0).normal(size=(7, 13)).astype(np.float32)
+    policy = make("my_agent:Mine", CartPoleEnv())
+    expected, _ = names["model"].predict(
+        names["venv"].normalize_obs(observation), deterministic=True
+    )
+    np.testing.assert_allclose(policy.predict(observation)[0], expected, atol=1e-5)
+
+
 # Curves
 
 
 def fake_record(name, seed, values, correction=None):
     training = replace(TINY, algorithm=ALGORITHMS[name], seed=seed, largest_correction=correction)
     curve = {"steps": [192, 384], "seconds": [1.0, 2.0], "cpu_seconds": [1.0, 2.0]}
-    figures = dict.fromkeys(("success", "strict", "effort"), values)
+    figures = dict.fromkeys(("success", "strict", "reward", "effort"), values)
     record = json.loads(json.dumps(training.record()))
     return {"training": record, "curve": curve | figures, "final": [{"success": values[-1]}]}
 
@@ -343,8 +493,30 @@ def test_curves_hold_median_and_range_of_the_seeds(tmp_path):
     changed["training"]["worlds"] = 9
     with pytest.raises(ValueError, match="differ in more than the seed"):
         curves_of([*ours, changed], "a command")
+    # One run that is counted five times is no interval of five.
+    with pytest.raises(ValueError, match=r"the seeds \[0, 4, 1, 3, 2, 4\]; give each of them once"):
+        curves_of([*ours, ours[1]], "a command")
     with pytest.raises(ValueError, match="one task"):
         curves_of([], "a command")
+
+
+@pytest.mark.parametrize("names", [["ppo", "sac", "td3"], ["td3", "ppo"], ["sac", "residual"]])
+def test_an_agent_looks_as_in_the_figure_of_the_benchmark(names, tmp_path, monkeypatch):
+    rows = dict(zip(["lagros", "ppo", "sac", "td3", "residual"], range(5), strict=True))
+    expected = canvas.styles(list(rows))
+    drawn = []
+    monkeypatch.setattr(curves_module, "save", lambda figure, _: drawn.append(figure))
+    corrected = {"residual": ("ppo", 4.0)}
+    records = []
+    for name in names:
+        algorithm, correction = corrected.get(name, (name, None))
+        records.append(fake_record(algorithm, 0, [0.0, 1.0], correction))
+    draw(curves_of(records, "a command"), tmp_path / "a.png")
+    for panel in drawn[0].axes:
+        colours = [line.get_color() for line in panel.get_lines()]
+        assert colours == [expected[name].colour for name in names]
+    assert drawn[0].axes[-1].get_xlabel() == "control steps [millions]"
+    np.testing.assert_allclose(drawn[0].axes[0].get_lines()[0].get_xdata(), [192e-6, 384e-6])
 
 
 def test_the_range_holds_the_median_as_often_as_it_says():
@@ -401,10 +573,13 @@ def test_the_folder_of_a_run_names_what_it_is(tmp_path):
         (["cartpole", "--seed", "-1"], "seed=-1"),
         (["cartpole", "--seed", "a"], "'a' is not a whole number"),
         (["cartpole", "--seed", ""], "must not be empty"),
+        (["cartpole", "--seed", "0,1,0"], "--seed names a run twice"),
+        (["cartpole", "--algo", "ppo,,ppo"], "--algo names a run twice"),
         (["cartpole", "--segments", "0"], "segments=0"),
         (["cartpole", "--parallel-env"], "for spacecraft"),
         (["spacecraft", "--residual", "3"], "for cartpole"),
         (["cartpole", "--residual", "-3"], "largest_correction=-3.0"),
+        (["cartpole", "--residual", "1e9"], "more than the actuator's 40 N"),
         (["cartpole", "--figure", "a.txt"], "must end in"),
     ],
 )

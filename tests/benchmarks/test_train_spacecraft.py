@@ -15,6 +15,7 @@ from lagros_benchmarks.training import spacecraft as training
 from lagros_benchmarks.training.agent import actor_network, make_agent
 from lagros_benchmarks.training.run import Place, train
 from lagros_benchmarks.training.settings import (
+    CURVE,
     FINAL,
     Ppo,
     SpacecraftTraining,
@@ -303,6 +304,41 @@ def test_settings_of_the_reward_are_positive(name):
 
 
 # The training
+
+
+def test_the_figures_are_of_worlds_that_neither_training_nor_the_benchmark_meets(monkeypatch):
+    run = replace(TINY, curve_episodes=20, final_episodes=30)
+    lesson = training.SpacecraftLesson(run)
+    flown = []
+
+    def spy(policy, preset, agents, seeds, *condition):
+        flown.append((preset, agents, seeds, *condition))
+        measures = dict.fromkeys(training.RATES, np.ones(agents * len(seeds), bool))
+        return {**measures, "effort_to_success": np.ones(4), "success_time": np.ones(4)}
+
+    monkeypatch.setattr(training, "evaluate", spy)
+    model = make_agent(run, lesson.venv)
+    lesson.figures(model)
+    lesson.final(model)
+    final = episode_seeds(0, 30, FINAL)
+    assert flown == [
+        ("paper", 2, episode_seeds(0, 20, CURVE), "uniform", 0.4),
+        ("open", 1, final, "uniform", 0.2),
+        ("open", 3, final, "uniform", 0.2),
+    ]
+
+
+@pytest.mark.parametrize("parallel_env", [False, True])
+def test_the_worlds_in_training_are_those_of_the_settings(parallel_env):
+    run = replace(TINY, disturbance="gust", disturbance_bound=0.3, preset="open", agents=3)
+    venv = training.SpacecraftLesson(run, parallel_env).venv
+    disturbance, settings = venv.get_attr("disturbance")[0], venv.get_attr("settings")[0]
+    assert (disturbance.kind, disturbance.bound) == ("gust", 0.3)
+    assert (settings.effort_weight, settings.progress_weight) == (0.05, 1.5)
+    assert settings.time_limit == run.time_limit
+    assert venv.num_envs == 6
+    assert venv.get_attr("preset")[0].agents == 3
+    assert venv.gamma == run.algorithm.discount
 
 
 def test_both_routes_train_the_same_agent():

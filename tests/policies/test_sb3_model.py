@@ -11,9 +11,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
+from typer.testing import CliRunner
 
+import lagros_policies
+from lagros_benchmarks.cli import app
+from lagros_benchmarks.sb3_parallel import ParallelVecEnv
+from lagros_envs import spacecraft_v0
 from lagros_envs.cartpole import CartPoleEnv
 from lagros_envs.cartpole_vector import CartPoleVectorEnv
+from lagros_envs.spacecraft_single import SpacecraftEnv
+from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
 from lagros_policies.sb3_model import (
     ALGORITHMS,
     StableBaselines3Policy,
@@ -124,6 +131,68 @@ def test_models_of_other_tasks_are_rejected(tmp_path):
     PPO("MlpPolicy", gym.make("Pendulum-v1"), device="cpu").save(path)
     with pytest.raises(ValueError, match=r"observations of shape \(3,\)"):
         load_stable_baselines3(path)
+
+
+@pytest.fixture(scope="module")
+def spacecraft_zip(tmp_path_factory):
+    """Return a model that three spacecraft share."""
+    worlds = ParallelVecEnv([spacecraft_v0.parallel_env(3, "paper")])
+    path = tmp_path_factory.mktemp("spacecraft") / "shared.zip"
+    PPO("MlpPolicy", worlds, policy_kwargs={"net_arch": [8]}, device="cpu", seed=2).save(path)
+    return path
+
+
+def test_a_model_of_spacecraft_flies_all_agents_of_all_worlds(spacecraft_zip):
+    env = SpacecraftVectorEnv(12, 3, "paper", "uniform", 0.4)
+    rows, _ = env.reset(seed=1)
+    expected, _ = PPO.load(spacecraft_zip, device="cpu").predict(rows, deterministic=True)
+    assert np.ptp(expected) > 0.01
+    for name in (str(spacecraft_zip), f"ppo:{spacecraft_zip}"):
+        policy = lagros_policies.make(name, spacecraft_v0.parallel_env(3, "paper"))
+        actions, state = policy.predict(rows)
+        np.testing.assert_array_equal(actions, expected)
+        assert actions.dtype == np.float32
+        assert state is None
+        np.testing.assert_allclose(policy.predict(rows[4])[0], expected[4], atol=1e-6)
+
+
+def test_a_model_of_a_single_spacecraft_is_one_of_worlds_of_one_agent(tmp_path):
+    path = tmp_path / "one.zip"
+    PPO("MlpPolicy", SpacecraftEnv("open"), policy_kwargs={"net_arch": [8]}, device="cpu").save(
+        path
+    )
+    env = spacecraft_v0.parallel_env(1, "open")
+    observations, _ = env.reset(seed=0)
+    action, _ = lagros_policies.make(str(path), env).predict(observations["agent_0"])
+    assert env.action_space("agent_0").contains(action)
+
+
+def test_a_model_of_spacecraft_is_refused_where_it_does_not_fit(spacecraft_zip, zips):
+    for env, text in (
+        (spacecraft_v0.parallel_env(2, "paper"), "worlds of 2 agents and at most 6 obstacles"),
+        (spacecraft_v0.parallel_env(3, "open"), "worlds of 3 agents and at most 0 obstacles"),
+        (CartPoleEnv(), "lagros/CartPole-v0 has"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            lagros_policies.make(str(spacecraft_zip), env)
+    with pytest.raises(ValueError, match=r"observations of shape \(13,\)"):
+        lagros_policies.make(str(zips["SAC"]), spacecraft_v0.parallel_env(3, "paper"))
+    with pytest.raises(ValueError, match="preset"):
+        load_stable_baselines3(spacecraft_zip, preset="nowhere")
+
+
+def test_models_of_both_tasks_are_rows_of_the_benchmark(zips, spacecraft_zip, tmp_path):
+    file = tmp_path / "rows.json"
+    few = ["--episodes", "1", "--timing-episodes", "1", "--bound", "0.4", "--json", str(file)]
+    for task, model in (
+        (["cartpole"], zips["TD3"]),
+        (["spacecraft", "--agents", "3", "--safety-filter", "none"], spacecraft_zip),
+    ):
+        result = CliRunner().invoke(app, ["bench", *task, "--policies", str(model), *few])
+        assert result.exit_code == 0, result.output
+        rows = json.loads(file.read_text())
+        assert {row["policy"] for row in rows} == {str(model)}
+        assert [row["errors"] for row in rows] == [[]] * len(rows)
 
 
 def test_the_missing_extra_is_named(zips, monkeypatch):

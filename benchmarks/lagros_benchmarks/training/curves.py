@@ -12,7 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from lagros_benchmarks.canvas import canvas, caption, check_figure_path, curve, save, styles
+from lagros_benchmarks.canvas import (
+    Style,
+    canvas,
+    caption,
+    check_figure_path,
+    curve,
+    save,
+    styles,
+)
 from lagros_benchmarks.surroundings import machine, versions
 
 # What is drawn of each task: name in the curves, title, factor.
@@ -20,7 +28,8 @@ _PANELS: dict[str, tuple[tuple[str, str, float], ...]] = {
     "cartpole": (
         ("success", "success [%]", 100.0),
         ("strict", "strict success [%]", 100.0),
-        ("effort", "effort [N² s]", 1.0),
+        ("reward", "reward of the task", 1.0),
+        ("effort", "effort of whole episodes [N² s]", 1.0),
     ),
     "spacecraft": (
         ("success", "success [%]", 100.0),
@@ -28,7 +37,14 @@ _PANELS: dict[str, tuple[tuple[str, str, float], ...]] = {
         ("collided", "collided [%]", 100.0),
     ),
 }
-_AXES = ("steps", "seconds", "cpu_seconds")
+_ABSCISSAE = {
+    "cartpole": "control steps [millions]",
+    "spacecraft": "control steps of all agents [millions]",
+}
+# Those that are rows of `lagros bench`, in the order in which its figure tells them apart.
+_AGENTS = ("ppo", "sac", "td3")
+# What a point of a curve has besides its figures.
+AXES = ("steps", "seconds", "cpu_seconds")
 
 
 def range_confidence(runs: int) -> float:
@@ -54,7 +70,8 @@ def curves_of(records: Sequence[dict[str, Any]], command: str) -> dict[str, Any]
         least and largest over the seeds, and those at the end of each seed.
 
     Raises:
-        ValueError: There is no record, or they are of several tasks.
+        ValueError: There is no record, or they are of several tasks, or runs of one algorithm
+            differ in more than the seed, or a seed is there twice.
     """
     tasks = {record["training"]["task"] for record in records}
     if len(tasks) != 1:
@@ -82,11 +99,15 @@ def _curve(label: str, group: Sequence[dict[str, Any]]) -> dict[str, Any]:
     shared = [{**record["training"], "seed": None} for record in group]
     if any(settings != shared[0] for settings in shared):
         raise ValueError(f"the runs of {label} differ in more than the seed")
-    names = [name for name in group[0]["curve"] if name not in _AXES]
+    seeds = [record["training"]["seed"] for record in group]
+    if len(set(seeds)) < len(seeds):
+        # The confidence of the range is that of independent runs.
+        raise ValueError(f"the runs of {label} have the seeds {seeds}; give each of them once")
+    names = [name for name in group[0]["curve"] if name not in AXES]
     return {
         "label": label,
         "training": shared[0],
-        "seeds": [record["training"]["seed"] for record in group],
+        "seeds": seeds,
         "confidence_of_range": range_confidence(len(group)),
         "steps": group[0]["curve"]["steps"],
         "figures": {name: _spread([record["curve"][name] for record in group]) for name in names},
@@ -118,12 +139,12 @@ def draw(curves: dict[str, Any], path: str | Path) -> Path:
     """
     path = check_figure_path(path)
     panels = _PANELS[curves["task"]]
-    figure, axes = canvas(6.0, 0.6 + 2.0 * len(panels), len(panels), 1, share="row")
+    figure, axes = canvas(6.0, 1.0 + 1.9 * len(panels), len(panels), 1, share="row")
+    looks = _looks([group["label"] for group in curves["curves"]])
     for panel, (name, title, factor) in zip(axes, panels, strict=True):
-        looks = styles([group["label"] for group in curves["curves"]])
         for group in curves["curves"]:
             spread, style = group["figures"][name], looks[group["label"]]
-            steps = 1e-3 * curve(group["steps"])
+            steps = 1e-6 * curve(group["steps"])
             low, middle, high = (
                 factor * curve(spread[part]) for part in ("least", "median", "largest")
             )
@@ -143,19 +164,24 @@ def draw(curves: dict[str, Any], path: str | Path) -> Path:
     figure.legend(
         handles, names, loc="outside upper left", ncols=4, frameon=False, handlelength=3.5
     )
+    axes[-1].set_xlim(left=0.0)
+    axes[-1].set_xlabel(_ABSCISSAE[curves["task"]])
     caption(figure, _caption(curves))
     return save(figure, path)
 
 
+def _looks(labels: Sequence[str]) -> dict[str, Style]:
+    """Return a style for each label; an agent looks as it does in the figures of `lagros bench`."""
+    return styles([*_AGENTS, *(label for label in labels if label not in _AGENTS)])
+
+
 def _caption(curves: dict[str, Any]) -> str:
     groups = curves["curves"]
-    unit = "control steps" if curves["task"] == "cartpole" else "control steps of all agents"
-    against = f"against thousands of {unit} of training"
     counts = sorted({len(group["seeds"]) for group in groups})
     if counts == [1]:
-        return f"{against}; one seed each, so that there is no interval"
+        return "one seed each, so that there is no interval"
     confidence = min(group["confidence_of_range"] for group in groups)
     return (
-        f"{against}; lines: median of {', '.join(map(str, counts))} seeds;\n"
-        f"bands: their range, which holds the median of all seeds with {confidence:.1%}"
+        f"lines: median of {', '.join(map(str, counts))} seeds; bands: their range, which holds\n"
+        f"the median of all seeds with confidence {100.0 * confidence:.4g} %"
     )

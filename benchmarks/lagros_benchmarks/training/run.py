@@ -28,6 +28,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from lagros_benchmarks.files import plain, write_atomic, write_json
 from lagros_benchmarks.surroundings import machine, versions
 from lagros_benchmarks.training.agent import make_agent
+from lagros_benchmarks.training.curves import AXES
 from lagros_benchmarks.training.settings import Training
 
 _LOG = logging.getLogger(__name__)
@@ -125,7 +126,7 @@ def train(
         curve.append(_point(model, figures, begun, curve))
         _write_events(model, figures)
         _save(place.checkpoint, settings, model, curve)
-        _LOG.info("%s: %s", place.folder, json.dumps(curve[-1]))
+        _LOG.info("%s %d/%d: %s", place.folder, len(curve), training.segments, _words(curve[-1]))
         if progress is not None:
             progress(segment + 1, training.segments)
     model.logger.close()
@@ -143,9 +144,27 @@ def _complete(place: Place, settings: Any) -> dict[str, Any]:
         stored = record["training"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{place.record} is damaged ({error}); delete {place.folder}") from error
-    if stored != settings:
-        raise ValueError(f"{place.folder} holds another run; delete it, or name another folder")
+    _check_same(place.folder, stored, settings)
     return record
+
+
+def _check_same(folder: Path, stored: Any, settings: Any) -> None:
+    if stored != settings:
+        raise ValueError(
+            f"{folder} holds another run ({_differences(stored, settings)}); delete it, or name "
+            "another folder"
+        )
+
+
+def _differences(stored: Any, settings: Any) -> str:
+    """Return in words in which settings a stored run differs from the one that was asked for."""
+    if not isinstance(stored, dict):
+        return "of settings that cannot be read"
+    return ", ".join(
+        f"{name} is {stored.get(name, 'missing')} there and {settings.get(name, 'missing')} here"
+        for name in {**settings, **stored}
+        if stored.get(name) != settings.get(name)
+    )
 
 
 def _outputs(place: Place, steps: int) -> list[KVWriter]:
@@ -197,6 +216,13 @@ def _point(
     }
 
 
+def _words(point: dict[str, float]) -> str:
+    """Return a point of the curve for a reader; the record has all digits."""
+    figures = {name: value for name, value in point.items() if name not in AXES}
+    seen = ", ".join(f"{name} {value:.3g}" for name, value in figures.items())
+    return f"{point['steps']} steps, {point['seconds']} s, {seen}"
+
+
 def _write_events(model: BaseAlgorithm, figures: dict[str, float]) -> None:
     for name, value in figures.items():
         model.logger.record(f"evaluation/{name}", value)
@@ -244,14 +270,10 @@ def _save(path: Path, settings: Any, model: BaseAlgorithm, curve: list[dict[str,
 def _restore(path: Path, settings: Any, model: BaseAlgorithm) -> list[dict[str, float]]:
     try:
         content = torch.load(path, weights_only=True)  # tensors and plain values: no pickled code
-        stored = content["training"]
+        stored = json.loads(content["training"])
     except Exception as error:
         raise ValueError(f"the checkpoint {path} is damaged ({error}); delete it") from error
-    if stored != json.dumps(settings, sort_keys=True):
-        raise ValueError(
-            f"the checkpoint {path} belongs to another run ({stored}); delete it, or name another "
-            "folder"
-        )
+    _check_same(path.parent, stored, settings)
     model.set_parameters(content["parameters"])
     for name, value in _variables(model).items():
         value.data.copy_(content["variables"][name])

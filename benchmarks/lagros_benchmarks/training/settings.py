@@ -11,10 +11,12 @@ import math
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, ClassVar
 
+from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.seeding import EVALUATION
 
 # Segments are namespaces of their own in `lagros_envs.seeding`'s sense, far below `EVALUATION`.
 MOST_SEGMENTS = 1 << 16
+MOST_SEEDS = 1 << 32  # what stable-baselines3 and NumPy's old generator take
 # Namespaces of the held-out episodes of a learning curve and of those at its end ("curv" and "last"
 # in ASCII): neither training nor `lagros bench` ever meets them.
 CURVE, FINAL = 0x63757276, 0x6C617374
@@ -180,8 +182,8 @@ class Training(_Ranged):
     def __post_init__(self) -> None:
         """Check the values."""
         super().__post_init__()
-        if self.seed < 0:
-            raise ValueError(f"seed={self.seed!r} must be a non-negative integer")
+        if not 0 <= self.seed < MOST_SEEDS:
+            raise ValueError(f"seed={self.seed!r} must be an integer from 0 to {MOST_SEEDS - 1}")
         if self.segments >= MOST_SEGMENTS:
             raise ValueError(
                 f"segments={self.segments} must be below {MOST_SEGMENTS}; make segment_steps larger"
@@ -240,6 +242,12 @@ class CartPoleTraining(Training):
         super().__post_init__()
         if self.largest_correction is not None:
             _check_positive("largest_correction", self.largest_correction)
+            most = CartPoleSettings().force_scale
+            if self.largest_correction > most:
+                raise ValueError(
+                    f"largest_correction={self.largest_correction!r} is more than the actuator's "
+                    f"{most:g} N; leave it out for an agent that controls the cart-pole alone"
+                )
 
     @property
     def label(self) -> str:
