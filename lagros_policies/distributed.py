@@ -20,13 +20,11 @@ from lagros_policies.planning.local_plan import LocalPlanner
 from lagros_policies.planning.local_problem import LocalPlannerSettings
 from lagros_policies.policy import PolicyState, row_memories
 from lagros_policies.sensed import Sensed
-from lagros_policies.spacecraft_setup import task_and_preset
+from lagros_policies.spacecraft_setup import PAIR_SHARE, PLANE, task_and_preset
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
-# Two agents err independently, so that their distance errs sqrt(2) times as far.
-_PAIR_SHARE = math.sqrt(2.0)
 # A neighbour slower than this [m/s] is taken to rest, plus this for each unit of the bound: what is
 # left of the disturbance in a smoothed velocity.
 _STILL, _STILL_NOISE = 0.04, 0.1
@@ -111,6 +109,7 @@ class DistributedTubeMpcPolicy:
     """
 
     name = "tube-mpc"
+    prepared = True  # `policy.make` tells it the bound of the environment's disturbance
     observes: Literal["local", "global"] = "local"
 
     def __init__(
@@ -177,7 +176,7 @@ class DistributedTubeMpcPolicy:
         following = [DistributedState() if memory is None else memory for memory in memories]
         nominal, accelerations = np.zeros((count, task.STATE_DIM)), np.zeros((count, 3))
         for row, memory in enumerate(following):
-            nominal[row, [0, 1, 3, 4]], accelerations[row, :2] = self._follow(sensed, row, memory)
+            nominal[row, PLANE], accelerations[row, :2] = self._follow(sensed, row, memory)
         states = np.zeros((count, task.STATE_DIM))
         states[:, :2], states[:, 3:5] = -sensed.goal, sensed.velocity
         states[:, 2], states[:, 5] = sensed.heading, sensed.spin
@@ -281,6 +280,6 @@ class DistributedTubeMpcPolicy:
             np.vstack([obstacles[:, :2], neighbours[:, :2]]),
             velocities,
             np.concatenate([obstacles[:, 2] + core, np.full(counts[1], 2.0 * preset.agent_radius)]),
-            np.repeat([self.margin, _PAIR_SHARE * self.margin], counts),
+            np.repeat([self.margin, PAIR_SHARE * self.margin], counts),
             np.concatenate([np.zeros(counts[0], bool), moving]),
         )

@@ -39,8 +39,6 @@ _SPACECRAFT = {
 }
 NAMES = tuple(_CARTPOLE)
 SPACECRAFT_NAMES = tuple(_SPACECRAFT)
-# Those that prepare their margins for a bound of the disturbance.
-PREPARED = ("tube-mpc", "centralized")
 
 
 @runtime_checkable
@@ -100,8 +98,9 @@ def make(name: str, env: Any, **settings: Any) -> Policy:
     Args:
         name: One of `NAMES` (`SPACECRAFT_NAMES` for the spacecraft); the path of a
             stable-baselines3 model (`ppo.zip`, `sac:model.zip`); or `module:Class`, a class of your
-            own that is built with the task's settings. A zip of stable-baselines3 holds pickled
-            code and a module is code: both run, so name only what you trust.
+            own that is built with the task's settings (and, where its attribute `prepared` is True,
+            with the bound of the disturbance as `disturbance_bound`). A zip of stable-baselines3
+            holds pickled code and a module is code: both run, so name only what you trust.
         env: A Gymnasium or PettingZoo environment of this package; the policy takes its task
             settings (and preset, and the bound of its disturbance) and nothing else.
         settings: Passed to the policy, e.g. `weights=path` or `metric=...`.
@@ -112,32 +111,48 @@ def make(name: str, env: Any, **settings: Any) -> Policy:
     Raises:
         ValueError: The name is unknown.
         TypeError: The environment is not one of this package.
+        ImportError: A package that the policy needs is not installed.
     """
     task = getattr(env.unwrapped, "settings", None)
     if isinstance(task, SpacecraftSettings):
         classes = _SPACECRAFT
         settings = {"preset": env.unwrapped.preset, **settings}
-        if name in PREPARED:
-            settings = {"disturbance_bound": env.unwrapped.disturbance.bound, **settings}
     elif isinstance(task, CartPoleSettings):
         classes = _CARTPOLE
     else:
         raise TypeError(f"there are no policies for {env}; use an environment of lagros_envs")
     if name in classes:
-        return _class_named(classes[name])(task, **settings)
+        return _built(_shipped_class(name, classes[name]), task, env, settings)
     if name.endswith(".zip"):
         from lagros_policies.sb3_model import load_stable_baselines3
 
         algorithm, _, path = name.rpartition(":")
         return load_stable_baselines3(path, algorithm or None, **settings)
     if ":" in name:
-        return _class_named(name)(task, **settings)
+        return _built(_class_named(name), task, env, settings)
     near = difflib.get_close_matches(name, classes, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     raise ValueError(
         f"policy {name!r} is not known.{hint} Use one of {', '.join(classes)}, the path of a "
         "stable-baselines3 zip, or module:Class"
     )
+
+
+def _built(policy: Callable[..., Policy], task: Any, env: Any, settings: dict[str, Any]) -> Policy:
+    if getattr(policy, "prepared", False):
+        settings = {"disturbance_bound": env.unwrapped.disturbance.bound, **settings}
+    return policy(task, **settings)
+
+
+def _shipped_class(name: str, place: str) -> Callable[..., Policy]:
+    module, _, attribute = place.partition(":")
+    try:
+        return cast("Callable[..., Policy]", getattr(importlib.import_module(module), attribute))
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f"policy {name!r} needs {error.name}, which is not installed: "
+            "pip install 'lagros[policies]'"
+        ) from error
 
 
 def _class_named(name: str) -> Callable[..., Policy]:

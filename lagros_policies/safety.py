@@ -23,8 +23,8 @@ from lagros_policies.barrier import BarrierSettings, BrakingBarrier, HalfPlanes
 from lagros_policies.contraction.thrusters import allocate, to_body
 from lagros_policies.half_planes import nearest
 from lagros_policies.policy import Policy, PolicyState
-from lagros_policies.sensed import Sensed
-from lagros_policies.spacecraft_setup import task_and_preset
+from lagros_policies.sensed import Sensed, WorldState
+from lagros_policies.spacecraft_setup import PLANE, task_and_preset
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -301,37 +301,26 @@ class SafetyFilter:
         The change of heading, which `state()` does not tell and nothing here needs, is zero.
         """
         n, m = self.preset.agents, self.layout.obstacles
-        ends = np.cumsum([1, task.STATE_DIM * n, 2 * n, OBSTACLE_DIM * m, m])
-        rows = np.asarray(observation, np.float64)
-        if rows.ndim != 2 or rows.shape[1] != ends[-1]:
-            raise ValueError(
-                f"the observation has shape {np.shape(observation)}; the state() of {n} agents and "
-                f"up to {m} obstacles has {ends[-1]} numbers: build the filter with the "
-                "environment's preset and num_agents"
-            )
-        if not np.all(np.isfinite(rows)):
-            raise ValueError("the observation is not finite")
-        time, states, goals, obstacles, mask = np.split(rows, ends[:-1], axis=1)
-        worlds = len(rows)
-        states, goals = states.reshape(worlds, n, -1), goals.reshape(worlds, n, 2)
-        moving = states[..., [0, 1, VELOCITY_X, VELOCITY_X + 1]]
+        time, states, goals, obstacles, mask = WorldState.of(n, m, observation)
+        worlds = len(time)
+        moving = states[..., PLANE]
         others = np.array([[j for j in range(n) if j != i] for i in range(n)], np.intp)
         # One agent alone has one slot for neighbours, which stays empty.
         neighbours = np.zeros((worlds, n, self.layout.neighbours, 4))
         neighbours[:, :, : n - 1] = moving[:, others.reshape(n, n - 1)] - moving[:, :, None]
         seen = np.linalg.norm(neighbours[..., :2], axis=-1) <= self.settings.sensing_radius
         seen &= n > 1
-        rims = np.repeat(obstacles.reshape(worlds, 1, m, OBSTACLE_DIM), n, axis=1)
+        rims = np.repeat(obstacles[:, None], n, axis=1)
         rims[..., :2] -= states[:, :, None, :2]
         reach = self.settings.sensing_radius + rims[..., 2]
-        near = (np.linalg.norm(rims[..., :2], axis=-1) <= reach) & (mask > 0.0)[:, None]
+        near = (np.linalg.norm(rims[..., :2], axis=-1) <= reach) & mask[:, None]
         heading = states[..., HEADING]
         own = (
             goals - states[..., :2],
             states[..., VELOCITY_X : VELOCITY_X + 2],
             np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=-1),
             states[..., [SPIN]],
-            np.repeat(time[:, None], n, axis=1),
+            np.repeat(time[:, None, None], n, axis=1),
         )
         return Sensed(
             np.concatenate(own, axis=-1).reshape(worlds * n, -1),

@@ -1,4 +1,4 @@
-"""What the rows of a spacecraft observation mean: its named parts as arrays."""
+"""What the rows of a spacecraft observation or global state mean: their named parts as arrays."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.observation import NEIGHBOUR_DIM, OBSTACLE_DIM, Layout
+from lagros_envs.spacecraft_task import STATE_DIM
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -101,4 +102,66 @@ class Sensed(NamedTuple):
             rows[:, at["neighbour_mask"]] > 0.0,
             rows[:, at["obstacles"]].reshape(count, -1, OBSTACLE_DIM),
             rows[:, at["obstacle_mask"]] > 0.0,
+        )
+
+
+class WorldState(NamedTuple):
+    """The global states `state()` of some worlds, by parts; B worlds, n agents, m obstacles.
+
+    Attributes:
+        time: t, shape (B,) [s].
+        states: x of every agent, shape (B, n, 6).
+        goals: Shape (B, n, 2) [m].
+        obstacles: Centres and radii, shape (B, m, 3) [m]; zero in slots without an obstacle.
+        obstacle_mask: Which slots have one, shape (B, m).
+    """
+
+    time: FloatArray
+    states: FloatArray
+    goals: FloatArray
+    obstacles: FloatArray
+    obstacle_mask: BoolArray
+
+    @classmethod
+    def of(cls, agents: int, obstacles: int, observation: NDArray[np.floating]) -> WorldState:
+        """Take global states apart; `observation.named_state_space` says how they are laid out.
+
+        Args:
+            agents: n, agents in a world.
+            obstacles: m, slots for obstacles.
+            observation: Shape (B, size), or (size,) for one world.
+
+        Returns:
+            The parts, in double precision.
+
+        Raises:
+            ValueError: The observation has another shape, is not finite, or is no global state.
+        """
+        ends = np.cumsum(
+            [1, STATE_DIM * agents, 2 * agents, OBSTACLE_DIM * obstacles, obstacles]
+        ).tolist()
+        rows = np.asarray(observation, np.float64)
+        if rows.ndim == 1:
+            rows = rows[None]
+        if rows.ndim != 2 or rows.shape[1] != ends[-1]:
+            raise ValueError(
+                f"the observation has shape {np.shape(observation)}; the state() of {agents} agents"
+                f" and up to {obstacles} obstacles has {ends[-1]} numbers: build the policy with "
+                "the environment's preset and num_agents, and its filter too"
+            )
+        if not np.isfinite(rows).all():
+            raise ValueError("the observation is not finite")
+        time, states, goals, discs, mask = np.split(rows, ends[:-1], axis=1)
+        if not np.isin(mask, (0.0, 1.0)).all():
+            raise ValueError(
+                f"the observation is not the state() of {agents} agents and up to {obstacles} "
+                "obstacles: the obstacles' mask is neither 0 nor 1"
+            )
+        worlds = len(rows)
+        return cls(
+            time[:, 0],
+            states.reshape(worlds, agents, STATE_DIM),
+            goals.reshape(worlds, agents, 2),
+            discs.reshape(worlds, obstacles, OBSTACLE_DIM),
+            mask > 0.0,
         )

@@ -20,6 +20,7 @@ from lagros_policies.centralized import planner_settings
 from lagros_policies.contraction.wrench_control import WrenchTracking
 from lagros_policies.pace import time_to_go
 from lagros_policies.planning.spacecraft import SpacecraftPlanner
+from lagros_policies.spacecraft_setup import PLANE
 
 FloatArray = NDArray[np.float64]
 
@@ -28,7 +29,6 @@ SEARCH_RADIUS = 15.0
 # Of the plans after the first.
 _NODE_PERIOD = 1.0  # [s]
 _EFFORT_TOLERANCE = 0.2
-_PLANE = [0, 1, 3, 4]  # position and velocity in the state
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class SpacecraftExpert:
             time = time_to_go(way, task.horizon - step * task.control_period)
             durations = np.ceil(time / node - 1e-9) * node
         plan = planner.plan(
-            states[:, _PLANE],
+            states[:, PLANE],
             scenario.goals,
             scenario.obstacles,
             scenario.obstacle_radii,

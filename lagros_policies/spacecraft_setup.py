@@ -1,9 +1,16 @@
-"""Which spacecraft a policy is for: the settings, preset and number of agents that all take."""
+"""Which spacecraft a policy is for: what its policies share of settings, preset and state."""
 
 from __future__ import annotations
 
+import math
+
 from lagros_envs.scenarios import Preset, preset_named
 from lagros_envs.spacecraft_task import SpacecraftSettings
+
+# Position and velocity in the state: plans lie in the plane, at a heading that rests.
+PLANE = [0, 1, 3, 4]
+# Two agents err independently, so that their distance errs sqrt(2) times as far.
+PAIR_SHARE = math.sqrt(2.0)
 
 
 def task_and_preset(

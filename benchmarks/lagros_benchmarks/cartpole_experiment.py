@@ -13,7 +13,14 @@ import numpy as np
 import lagros_envs  # noqa: F401  (registers the environments, in worker processes too)
 from lagros_benchmarks.episodes import EpisodeRecord, describe_error, run_episode, timed_action
 from lagros_benchmarks.experiment import BenchmarkRun
-from lagros_benchmarks.library import Environment, FloatArray, Policy, SetupError, Toolbox
+from lagros_benchmarks.library import (
+    BareNetwork,
+    Environment,
+    FloatArray,
+    Policy,
+    SetupError,
+    Toolbox,
+)
 from lagros_benchmarks.settings import BenchmarkSettings, Case, Condition
 from lagros_benchmarks.workers import Progress, gather, split
 
@@ -199,10 +206,9 @@ def plan_nominals(
 
 def forward_time(policy: Policy) -> float | None:
     """Return the median time of the policy's bare network on one input [s], or None."""
-    forward = getattr(policy, "bare_forward", None)
-    if forward is None:
+    if not isinstance(policy, BareNetwork):
         return None
-    features = policy.example_features()  # type: ignore[attr-defined]
+    forward, features = policy.bare_forward, policy.example_features()
     times = np.empty(_FORWARD_CALLS)
     for call in range(_FORWARD_CALLS):
         begin = perf_counter()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lagros_benchmarks.cartpole_experiment import CartPoleRun
-from lagros_benchmarks.episodes import TUBE_TOLERANCE, EpisodeRecord
+from lagros_benchmarks.episodes import TUBE_TOLERANCE, EpisodeRecord, added_up
 from lagros_benchmarks.experiment import Row
 from lagros_benchmarks.library import FloatArray
 from lagros_benchmarks.metrics import (
@@ -35,7 +34,7 @@ def rows(run: CartPoleRun) -> list[Row]:
             **_efforts(records),
             **_times(run, case),
             **_tracking(run, case),
-            "counters": _counters(records),
+            "counters": added_up(record.counters for record in records),
             "errors": [{"seed": r.seed, "text": r.error} for r in records if r.error is not None],
             "versus": _versus(run, case),
         }
@@ -81,14 +80,6 @@ def _outcomes(records: Sequence[EpisodeRecord]) -> Row:
         "collision_rate": 0.0,
         "success_time_median_s": float(np.median(times)) if times else None,
     }
-
-
-def _counters(records: Sequence[EpisodeRecord]) -> dict[str, int]:
-    # Counter's own sum drops what is zero, and "failed plans: 0" is worth saying.
-    total: Counter[str] = Counter()
-    for record in records:
-        total.update(record.counters)
-    return dict(total)
 
 
 def _efforts(records: Sequence[EpisodeRecord]) -> Row:

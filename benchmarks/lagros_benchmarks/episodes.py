@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
@@ -91,6 +92,15 @@ class _Trace:
 def describe_error(error: BaseException) -> str:
     """Return the type and the text of an exception on one line."""
     return f"{type(error).__name__}: {error}".replace("\n", " ")
+
+
+def added_up(counters: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """Return the sums of what several episodes have counted, by name; zeros are kept."""
+    total: dict[str, int] = {}
+    for counts in counters:
+        for name, count in counts.items():
+            total[name] = total.get(name, 0) + count
+    return total
 
 
 def timed_action(

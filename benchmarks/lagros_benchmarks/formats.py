@@ -11,15 +11,16 @@ from lagros_benchmarks.experiment import Row
 # The letters that the paper gives its methods.
 _LETTERS = {"learned": "(a)", "tube-mpc": "(b)", "lagros": "(c)", "centralized": "(d)"}
 LONGEST_LABEL = 12
+_DIGITS = 3
 # Heading (two lines) and content of a column.
 Column = tuple[str, str, Callable[[Row], str]]
 
 
 def policy_label(policy: str, longest: int = LONGEST_LABEL) -> str:
-    """Return the name of a policy in tables and figures: letter and name, or the file's name."""
+    """Return the name of a policy in tables and figures: letter and name, its file or its class."""
     if policy in _LETTERS:
         return f"{_LETTERS[policy]} {policy}"
-    name = Path(policy).name if policy.endswith(".zip") else policy
+    name = Path(policy).name if policy.endswith(".zip") else policy.rpartition(":")[2]
     return name if len(name) <= longest else name[: longest - 1] + "…"
 
 
@@ -61,17 +62,17 @@ def by_condition(rows: Sequence[Row]) -> list[list[Row]]:
     return [list(group) for _, group in groups]
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """Return a number with so many significant digits and no exponent; a dash for none."""
+def number(value: float | None) -> str:
+    """Return a number with three significant digits and no exponent; a dash for none."""
     if value is None or value != value:
         return "–"
     if value == 0:
         return "0"
     if not 1e-6 < abs(value) < 10**7:
         return f"{value:.0e}".replace("+0", "").replace("+", "")
-    decimals = max(digits - len(str(int(abs(value)))), 0)
+    decimals = max(_DIGITS - len(str(int(abs(value)))), 0)
     if abs(value) < 1:
-        decimals = digits - 1 - _exponent(value)
+        decimals = _DIGITS - 1 - _exponent(value)
     return f"{value:.{decimals}f}"
 
 
@@ -108,9 +109,9 @@ def milliseconds(seconds: float | None) -> str:
     return f"{1e3 * seconds:.3f}" if seconds < 1e-3 else number(1e3 * seconds)
 
 
-def signed(value: float, decimals: int = 1) -> str:
-    """Return a number with its sign, and a true minus."""
-    return f"{value:+.{decimals}f}".replace("-", "−")
+def signed(value: float) -> str:
+    """Return a number with its sign, a true minus, and one decimal."""
+    return f"{value:+.1f}".replace("-", "−")
 
 
 def markdown_table(headings: Sequence[str], contents: Sequence[Sequence[str]]) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
@@ -26,9 +26,8 @@ class Policy(Protocol):
     """What an episode needs of a policy: `predict` of stable-baselines3's protocol.
 
     A policy may also have `counters(state) -> dict[str, int]`, `reseed(generator)` for what it
-    draws itself and, to time its network alone, `bare_forward` and `example_features()`. One of the
-    spacecraft says by `observes` whether it is fed the rows of all agents ("local") or `state()` of
-    all worlds ("global").
+    draws itself, and a `BareNetwork`. One of the spacecraft says by `observes` whether it is fed
+    the rows of all agents ("local") or `state()` of all worlds ("global").
     """
 
     def predict(
@@ -39,6 +38,19 @@ class Policy(Protocol):
         deterministic: bool = True,
     ) -> tuple[Any, Any]:
         """Return the action and the policy's state."""
+        ...
+
+
+@runtime_checkable
+class BareNetwork(Protocol):
+    """What a policy has whose network can be timed alone."""
+
+    def bare_forward(self, features: Any) -> Any:
+        """Evaluate the network."""
+        ...
+
+    def example_features(self) -> Any:
+        """Return an input of it."""
         ...
 
 
@@ -94,17 +106,20 @@ def make_filter(policy: Any, env: Any, disturbance_bound: float) -> Policy:
 
 
 def position_margin(policy: Policy, disturbance_bound: float) -> float | None:
-    """Return the certified bound of the position error to x_d [m], of a policy that tracks with u*.
+    """Return the certified bound of the position error to x_d [m], of a policy that tracks a plan.
 
     Args:
-        policy: The policy; None is returned unless it is the centralised one, whose tracking law is
-            the one that the bound holds for.
+        policy: The policy; None is returned unless its tracking law is one that a bound holds for:
+            u* or the sliding-variable law of a centralised policy.
         disturbance_bound: d_bar, in units of the state per second.
     """
     from lagros_policies.contraction.double_integrator import certified_margin
+    from lagros_policies.contraction.lagrangian import SlidingTracking, steady_position_bound
     from lagros_policies.contraction.wrench_control import WrenchTracking
 
     tracking = getattr(policy, "tracking", None)
+    if isinstance(tracking, SlidingTracking):
+        return steady_position_bound(tracking.plane, disturbance_bound)
     if not isinstance(tracking, WrenchTracking):
         return None
     return certified_margin(tracking.plane, disturbance_bound)

@@ -225,9 +225,9 @@ class _CartPoleGame:
     def start(self) -> None:
         _reseed(self._policy, self._seed)
         # On an environment without a window, which would stand still while this plans.
-        planned = gym.make("lagros/CartPole-v0", disable_env_checker=True).unwrapped
+        planned: Any = gym.make("lagros/CartPole-v0", disable_env_checker=True).unwrapped
         planned.reset(seed=self._seed)
-        scenario: Any = planned.scenario  # type: ignore[attr-defined]
+        scenario = planned.scenario
         plan = library.make_planner().plan(scenario.initial_state, scenario.goal)
         options = {"nominal": np.asarray(plan.states)} if plan.solved else {}
         self._observation, self._info = self.env.reset(seed=self._seed, options=options)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_benchmarks.episodes import TUBE_TOLERANCE, describe_error
+from lagros_benchmarks.episodes import TUBE_TOLERANCE, added_up, describe_error
 from lagros_benchmarks.library import FloatArray, Policy
 from lagros_envs.seeding import episode_streams
 from lagros_envs.spacecraft_task import THRUSTERS
@@ -207,10 +207,7 @@ def fly_chunk(
             return flight
     env = make_env(1)
     flights = [fly(env, policy, [seed], margin) for seed in seeds]
-    counters: dict[str, int] = {}
-    for flight in flights:
-        for name, count in flight.counters.items():
-            counters[name] = counters.get(name, 0) + count
+    counters = added_up(flight.counters for flight in flights)
     return Flight(tuple(world for flight in flights for world in flight.worlds), counters)
 
 

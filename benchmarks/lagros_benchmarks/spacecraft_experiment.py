@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lagros_benchmarks.episodes import describe_error
+from lagros_benchmarks.episodes import added_up, describe_error
 from lagros_benchmarks.experiment import BenchmarkRun
 from lagros_benchmarks.library import FloatArray, Policy, SetupError, Toolbox
 from lagros_benchmarks.settings import BenchmarkSettings, Case
@@ -26,7 +26,6 @@ from lagros_benchmarks.spacecraft_timing import PLAN_WORLDS, Timing, time_plans,
 from lagros_benchmarks.workers import Progress
 from lagros_envs.scenarios import Scenario
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
-from lagros_policies.policy import PREPARED
 
 Value = TypeVar("Value")
 
@@ -132,9 +131,7 @@ class SpacecraftExperiment:
     def policy(self, case: Case, env: SpacecraftVectorEnv) -> Policy:
         """Build the policy of a case, with its filter."""
         name, bound = case.policy, case.condition.bound
-        told = {"disturbance_bound": bound} if name in PREPARED else {}
-        settings = {**told, **self.settings.policy_settings.get(name, {})}
-        policy = self.toolbox.make_policy(name, env, settings)
+        policy = self.toolbox.make_policy(name, env, self.settings.policy_settings.get(name, {}))
         return self.toolbox.make_filter(policy, env, bound) if case.safety_filter else policy
 
     def units(self, progress: Progress | None) -> list[int]:
@@ -170,12 +167,6 @@ class SpacecraftExperiment:
         timing: Mapping[Case, Any] | None,
     ) -> SpacecraftRun:
         """Put the run together."""
-        counters: dict[Case, dict[str, int]] = {}
-        for case, flights in outcomes.items():
-            counters[case] = {}
-            for flight in flights:
-                for name, count in flight.counters.items():
-                    counters[case][name] = counters[case].get(name, 0) + count
         return SpacecraftRun(
             settings=self.settings,
             episodes={
@@ -184,7 +175,10 @@ class SpacecraftExperiment:
             },
             timing=timing or {},
             control_period=self.control_period,
-            counters=counters,
+            counters={
+                case: added_up(flight.counters for flight in flights)
+                for case, flights in outcomes.items()
+            },
         )
 
     def _margin(self, policy: Policy, case: Case) -> float | None:

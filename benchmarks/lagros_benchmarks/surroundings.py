@@ -17,7 +17,6 @@ _PACKAGES = (
     "torch",
     "piqp",
     "clarabel",
-    "osqp",
     "stable-baselines3",
 )
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -60,7 +59,8 @@ def threads() -> dict[str, Any]:
 def own_command() -> list[str]:
     """Return the command line of this process, without the folder of the program."""
     name = os.path.basename(sys.argv[0]) if sys.argv else ""
-    return [name, *sys.argv[1:]]
+    # `python -m lagros_benchmarks` is the same command under the name of its file.
+    return ["lagros" if name == "__main__.py" else name, *sys.argv[1:]]
 
 
 @cache

@@ -1,6 +1,6 @@
 """What the commands say on the terminal: errors without a traceback, lists, progress.
 
-Only the standard library and typer are imported here.
+Only the standard library, typer and `extras` are imported here.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import typer
+
+from lagros_benchmarks.extras import install_hint
 
 if TYPE_CHECKING:
     from lagros_benchmarks.workers import Progress
@@ -21,7 +23,10 @@ Value = TypeVar("Value")
 
 def fail(error: Exception | str, status: int = USAGE_ERROR) -> NoReturn:
     """Say what is wrong, without a traceback, and end with the exit status."""
-    typer.echo(f"lagros: {error}", err=True)
+    text = str(error)
+    if isinstance(error, Exception) and "pip install" not in text:
+        text += install_hint(error)
+    typer.echo(f"lagros: {text}", err=True)
     raise typer.Exit(status)
 
 

@@ -9,7 +9,7 @@ the right.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,10 +47,10 @@ class GridSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
+        for item in fields(self):
+            value = getattr(self, item.name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name}={value!r} must be finite and >= 0")
+                raise ValueError(f"{item.name}={value!r} must be finite and >= 0")
         if not (self.cell > 0.0 and self.search_cell > 0.0 and self.search_period > 0.0):
             raise ValueError("cell, search_cell and search_period must be > 0")
         if self.preference >= 1.0:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -12,6 +14,10 @@ from lagros_policies.planning.vectors import unit_vectors
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+# Entries of some equalities by row, column and value, and their right sides.
+Equalities = tuple[list[tuple[IntArray, IntArray, FloatArray]], FloatArray]
+
+_PLACE, _SPEED = slice(0, 2), slice(2, 4)  # in a state
 
 
 class ProgramLayout:
@@ -29,63 +35,72 @@ class ProgramLayout:
         nodes, n = problem.nodes, len(problem.starts)
         block = np.arange(nodes + 1)[:, None, None] * (6 * n)
         agent = np.arange(n)[None, :, None] * 6
-        self.forces = (block + agent + np.arange(2))[:nodes]  # (N, n, 2)
+        forces = block + agent + np.arange(2)  # (N + 1, n, 2)
+        self.forces = forces[:nodes]
         self.states = block + agent + 2 + np.arange(4)  # (N + 1, n, 4)
-        # From the arrival on, the last node included, there is no force: pinned to zero.
         self.size = (nodes + 1) * 6 * n
+        # From the arrival on, the last node included, there is no force: pinned to zero.
+        arrivals = np.full(n, nodes) if problem.arrivals is None else problem.arrivals
+        self.idle = forces[np.arange(nodes + 1)[:, None] >= arrivals].ravel()
+        self.start_errors = np.empty(0, dtype=np.intp)
+        self.count = 0
+        parts = self._dynamics(problem), self._goals(problem, arrivals), self._starts(problem)
+        entries = [entry for some, _ in parts for entry in some]
+        self.rows, self.columns, self.values = (
+            np.concatenate([entry[index].ravel() for entry in entries]) for index in range(3)
+        )
+        self.target = np.concatenate([target.ravel() for _, target in parts])
+
+    def _new_rows(self, shape: tuple[int, ...]) -> IntArray:
+        """Return the numbers of as many new equalities, in this shape."""
+        rows = self.count + np.arange(math.prod(shape)).reshape(shape)
+        self.count += rows.size
+        return rows
+
+    def _dynamics(self, problem: JointProblem) -> Equalities:
+        """Double integrators under forces that are held between the nodes."""
         h = problem.node_period
         here, there = self.states[:-1], self.states[1:]
-        place, speed = slice(0, 2), slice(2, 4)
-        one = np.ones(here[..., place].shape)
-        rows = np.arange(nodes * n * 4).reshape(nodes, n, 4)
+        rows = self._new_rows(here.shape)
+        one = np.ones(here[..., _PLACE].shape)
         entries = [
-            (rows[..., place], there[..., place], one),
-            (rows[..., place], here[..., place], -one),
-            (rows[..., place], here[..., speed], -h * one),
-            (rows[..., place], self.forces, -0.5 * h**2 / problem.mass * one),
-            (rows[..., speed], there[..., speed], one),
-            (rows[..., speed], here[..., speed], -one),
-            (rows[..., speed], self.forces, -h / problem.mass * one),
+            (rows[..., _PLACE], there[..., _PLACE], one),
+            (rows[..., _PLACE], here[..., _PLACE], -one),
+            (rows[..., _PLACE], here[..., _SPEED], -h * one),
+            (rows[..., _PLACE], self.forces, -0.5 * h**2 / problem.mass * one),
+            (rows[..., _SPEED], there[..., _SPEED], one),
+            (rows[..., _SPEED], here[..., _SPEED], -one),
+            (rows[..., _SPEED], self.forces, -h / problem.mass * one),
         ]
-        count = rows.size
-        goal_target = problem.goals
-        ends = count + np.arange(goal_target.size).reshape(goal_target.shape)
-        arrivals = np.full(n, nodes) if problem.arrivals is None else problem.arrivals
-        entries.append((ends, self.states[arrivals, np.arange(n)], np.ones(goal_target.shape)))
-        stays = np.arange(nodes + 1)[:, None] >= arrivals
-        self.idle = (block + agent + np.arange(2))[stays].ravel()
-        count += goal_target.size
-        start = count + np.arange(problem.starts.size).reshape(problem.starts.shape)
-        start_target = problem.starts
-        self.start_errors = np.empty(0, dtype=np.intp)
+        return entries, np.zeros(rows.shape)
+
+    def _goals(self, problem: JointProblem, arrivals: IntArray) -> Equalities:
+        """Every agent at its goal at its arrival."""
+        rows = self._new_rows(problem.goals.shape)
+        states = self.states[arrivals, np.arange(len(arrivals))]
+        return [(rows, states, np.ones(rows.shape))], problem.goals
+
+    def _starts(self, problem: JointProblem) -> Equalities:
+        """Every agent at its start, or beside it by unknowns r = U e with Q = U'U.
+
+        These make the cost of the deviation e a diagonal one.
+        """
+        starts, first = problem.starts, self.states[0]
+        rows = self._new_rows(starts.shape)
         if problem.start_cost is None:
-            entries.append((start, self.states[0], np.ones(start_target.shape)))
-        else:
-            # Unknowns r = U e with Q = U'U make the cost of the deviation a diagonal one.
-            root = np.linalg.cholesky(problem.start_cost).T
-            self.start_errors = self.size + np.arange(start_target.size)
-            self.size += start_target.size
-            first = self.states[0]
-            entries += [
-                (start[:, place], first[:, place], np.full((n, 2), root[0, 0])),
-                (start[:, place], first[:, speed], np.full((n, 2), root[0, 1])),
-                (start[:, speed], first[:, speed], np.full((n, 2), root[1, 1])),
-                (start.ravel(), self.start_errors, np.full(start.size, -1.0)),
-            ]
-            start_target = np.hstack(
-                [
-                    root[0, 0] * problem.starts[:, :2] + root[0, 1] * problem.starts[:, 2:],
-                    root[1, 1] * problem.starts[:, 2:],
-                ]
-            )
-        count += start_target.size
-        self.count = count
-        self.rows, self.columns, self.values = (
-            np.concatenate([part[index].ravel() for part in entries]) for index in range(3)
-        )
-        self.target = np.concatenate(
-            [np.zeros(rows.size), goal_target.ravel(), start_target.ravel()]
-        )
+            return [(rows, first, np.ones(rows.shape))], starts
+        root = np.linalg.cholesky(problem.start_cost).T
+        self.start_errors = self.size + np.arange(starts.size)
+        self.size += starts.size
+        n = len(starts)
+        entries = [
+            (rows[:, _PLACE], first[:, _PLACE], np.full((n, 2), root[0, 0])),
+            (rows[:, _PLACE], first[:, _SPEED], np.full((n, 2), root[0, 1])),
+            (rows[:, _SPEED], first[:, _SPEED], np.full((n, 2), root[1, 1])),
+            (rows.ravel(), self.start_errors, np.full(rows.size, -1.0)),
+        ]
+        place, speed = starts[:, _PLACE], starts[:, _SPEED]
+        return entries, np.hstack([root[0, 0] * place + root[0, 1] * speed, root[1, 1] * speed])
 
     def program(
         self, problem: JointProblem, places: FloatArray, settings: JointScpSettings

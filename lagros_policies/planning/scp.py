@@ -10,7 +10,7 @@ on effort and halves the cost of a pass.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,9 +53,10 @@ class ScpSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name in self.__dataclass_fields__:
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}={getattr(self, name)!r} must be > 0")
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not value > 0:
+                raise ValueError(f"{item.name}={value!r} must be > 0")
 
 
 @dataclass(frozen=True)
@@ -116,23 +117,21 @@ class ScpSolver:
         low: FloatArray,
         high: FloatArray,
         guess: tuple[FloatArray, FloatArray] | None = None,
-        horizon: int | None = None,
     ) -> Trajectory:
         """Plan from one state to another.
 
         Args:
             initial_state: x_d(0), shape (n,).
             terminal_state: x_d(T), shape (n,).
-            low: Lower bounds of x_1 ... x_{N-1}, shape (N - 1, n); -inf for none.
+            low: Lower bounds of x_1 ... x_{N-1}, shape (N - 1, n), which says N; -inf for none.
             high: Upper bounds, likewise.
             guess: States (N + 1, n) and controls (N, m) to start from; a straight line without.
-            horizon: Control steps N; taken from the bounds if left out.
 
         Returns:
             The plan; `solved` is False, and `status` says why, where it does not hold.
         """
-        horizon = len(low) + 1 if horizon is None else horizon
         if guess is None:
+            horizon = len(low) + 1
             states = np.linspace(initial_state, terminal_state, horizon + 1)
             controls = np.zeros((horizon, self.system.control_dim))
         else:

@@ -1,12 +1,16 @@
-"""The tables of docs/reproduction.md: from rows to Markdown, and into the page."""
+"""docs/reproduction.md: its tables, from rows to Markdown and into the page, and derivations."""
 
 import json
+import re
 from pathlib import Path
+from textwrap import dedent
 
+import numpy as np
 import pytest
 from studies import reproduction_table as page
 
 ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "reproduction.md"
 
 
 def cartpole_row(policy, **values):
@@ -17,6 +21,7 @@ def cartpole_row(policy, **values):
         "success_ci95": [0.4, 0.6],
         "effort_mean": 12.0,
         "effort_ci95": [10.0, 14.0],
+        "effort_total_mean": 13.0,
         "step_time_median_s": 2.5e-3,
         "mean_tracking_error": [0.0, 0.5, None],
         "tracking_error_mean_below_tube": True,
@@ -30,11 +35,11 @@ def test_ours_stand_beside_the_papers():
     rows = [cartpole_row("lagros"), cartpole_row("learned", bound=0.3)]
     lines = page.cartpole_table(rows).splitlines()
     assert lines[-1].startswith(
-        "| (c) lagros | 100.0 | 50.0 (40.0–60.0) | 567 | 12.0 (10.0–14.0) |"
+        "| (c) lagros | 100.0 | 50.0 (40.0–60.0) | 567 | 56.7 | 12.0 (10.0–14.0) | 13.0 |"
     )
     assert "30.1 ms | 2.5 ms |" in lines[-1]
     # (a) was only run under another bound, (b) not at all.
-    assert lines[2].count("–") == lines[3].count("–") == 3
+    assert lines[2].count("–") == lines[3].count("–") == 4
     assert "| 0.500 | 3.1 |" in page.cartpole_curve_table(rows)
     assert "| 1.092 | 1.25 (1.20–1.30) |" in page.ratio_table(rows, [], [])
 
@@ -69,6 +74,82 @@ def test_page_keeps_all_but_its_tables():
         page.update(text, {"three": ""})
 
 
-def test_the_page_has_a_place_for_every_table(tmp_path):
-    text = (ROOT / "docs" / "reproduction.md").read_text()
-    page.update(text, page.tables(tmp_path))
+def test_the_page_holds_what_the_published_results_say():
+    text = PAGE.read_text()
+    assert page.update(text, page.tables(ROOT / "benchmarks" / "results")) == text
+
+
+def test_success_by_the_papers_radius_has_a_line_of_its_own():
+    row = {
+        "policy": "lagros",
+        "bound": 0.2,
+        "success_rate": 0.97,
+        "success_world_ci95": [0.96, 0.98],
+        "paper_success_rate": 0.91,
+        "paper_success_world_ci95": [0.9, 0.92],
+    }
+    lines = page.spacecraft_success_table([row], []).splitlines()
+    assert any("| ours, r(t) | 91.0 (90.0–92.0) |" in line for line in lines)
+    assert any("| ours | 97.0 (96.0–98.0) |" in line for line in lines)
+
+
+def test_published_efforts_of_the_spacecraft_are_shared_among_agents_and_steps():
+    # 1785 over six agents, in steps of 0.1 s.
+    assert "| paper / 60 | 29.8 |" in page.spacecraft_effort_table([], [])
+
+
+def test_published_rates_belong_to_270_agents():
+    rates = [rate for row in page._FIGURE_SUCCESS.values() for rate in row]
+
+    def fits(agents):
+        nearest = [100.0 * round(0.01 * rate * agents) / agents for rate in rates]
+        return np.allclose(nearest, rates, rtol=0.0, atol=0.0501)
+
+    assert [agents for agents in range(20, 361) if fits(agents)] == [270]
+
+
+def snippet(first_words):
+    """Return the indented program of the page that begins so."""
+    text = PAGE.read_text()
+    found = re.search(rf"^( +){re.escape(first_words)}.*\n(?:\1.*\n)+", text, re.MULTILINE)
+    assert found is not None
+    return dedent(found[0])
+
+
+def test_the_least_condition_number_at_the_upright(capsys):
+    exec(snippet("from lagros_policies.contraction import"), {})
+    lines = capsys.readouterr().out.split()
+    bounds, weights = lines[::2], lines[1::2]
+    text = PAGE.read_text()
+    assert f"χ = {', '.join(bounds)} and" in text
+    assert f"ν = {', '.join(weights)}." in text
+    assert np.all(np.diff([float(bound) for bound in bounds]) < 0.0)
+    assert float(bounds[-1]) >= 114.8
+
+
+def test_the_bound_below_it_needs_no_weight():
+    """On the null space of B' the condition does not know nu; the linearisation is by hand."""
+    import cvxpy as cp
+
+    total, inertia, rate = 1.1, 0.5 * (4.0 / 3.0 - 0.1 / 1.1), 0.6
+    spin = np.array([0.0, 9.8, 0.5 / total, -0.002 / (0.1 * 0.5)]) / inertia
+    push = -1.0 / total / inertia
+    share = 0.1 * 0.5 / total
+    speed = np.array([0.0, 0.0, -0.5 / total, 0.0]) - share * spin
+    slope = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0], speed, spin])
+    effect = np.array([0.0, 0.0, 1.0 / total - share * push, push])
+    assert np.linalg.norm(effect) == pytest.approx(1.759, abs=5e-4)
+
+    free = np.linalg.svd(effect[None])[2][1:].T
+    dual, bound = cp.Variable((4, 4), symmetric=True), cp.Variable()
+    flow = slope @ dual + dual @ slope.T + 2.0 * rate * dual
+    ordered = [dual >> np.eye(4), dual << bound * np.eye(4), free.T @ flow @ free << 0]
+    cp.Problem(cp.Minimize(bound), ordered).solve(solver="CLARABEL")
+    assert bound.value == pytest.approx(114.8, abs=0.05)
+    assert 0.75 / rate * np.sqrt(bound.value) == pytest.approx(13.4, abs=0.05)
+
+
+@pytest.mark.slow
+def test_what_a_plan_of_the_cartpole_costs(capsys):
+    exec(snippet("import gymnasium as gym"), {})
+    assert f"{float(capsys.readouterr().out):.1f} N²s in the mean" in PAGE.read_text()

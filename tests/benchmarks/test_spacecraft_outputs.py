@@ -133,7 +133,7 @@ def test_tables_fit_80_columns_and_lose_nothing(sweep, change):
         for figure in ("99.9 (99.9–100.0)", "(d) centralized", "12346", "(c) lagros"):
             assert figure in text
         # No heading or number was cut off; a name of the user's is.
-        assert all("mine:ACon" in line for line in text.splitlines() if "…" in line)
+        assert all("ACon" in line for line in text.splitlines() if "…" in line)
 
 
 def test_the_filter_stands_below_its_policy(sweep):

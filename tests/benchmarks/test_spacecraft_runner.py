@@ -119,11 +119,11 @@ def test_parallel_equals_serial():
     assert any(error is not None for error in raised)
 
 
-def test_the_bound_is_told_to_those_that_plan():
+def test_a_policy_is_built_with_its_settings_for_the_bound_of_its_case():
     told = []
 
     def make(name, env, settings):
-        told.append((name, settings))
+        told.append((name, (env.unwrapped.disturbance.bound, settings)))
         return fakes.SpringPolicy()
 
     toolbox = dataclasses.replace(fakes.TOOLBOX, make_policy=make)
@@ -137,9 +137,9 @@ def test_the_bound_is_told_to_those_that_plan():
     )
     run_benchmark(settings, toolbox)
     assert dict(told) == {
-        "learned": {"weights": "w"},
-        "tube-mpc": {"disturbance_bound": 0.7, "horizon": 3.0},
-        "centralized": {"disturbance_bound": 0.7},
+        "learned": (0.7, {"weights": "w"}),
+        "tube-mpc": (0.7, {"horizon": 3.0}),
+        "centralized": (0.7, {}),
     }
 
 

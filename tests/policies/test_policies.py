@@ -1,5 +1,7 @@
 """What every policy has in common: names, protocol, batches, and what it needs not import."""
 
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -90,6 +92,13 @@ def test_unknown_name_is_refused_with_a_hint_and_the_names(env, name, hint):
     if hint is not None:
         assert f"Did you mean '{hint}'?" in str(caught.value)
     assert all(known in str(caught.value) for known in NAMES)
+
+
+def test_a_package_that_is_missing_is_named(env, monkeypatch):
+    monkeypatch.delitem(sys.modules, "lagros_policies.lagros")
+    monkeypatch.setitem(sys.modules, "lagros_policies.imitation.network_policy", None)
+    with pytest.raises(ImportError, match=r"policy 'lagros' needs .*lagros\[policies\]"):
+        make("lagros", env)
 
 
 def test_environment_of_another_package_is_refused():

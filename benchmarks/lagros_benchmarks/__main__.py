@@ -1,0 +1,24 @@
+"""The command `lagros`, also as `python -m lagros_benchmarks`."""
+
+from __future__ import annotations
+
+import sys
+
+from lagros_benchmarks.extras import install_hint
+
+
+def main() -> None:
+    """Run the command line; where it lacks a package of an extra, say which and end with 1."""
+    try:
+        from lagros_benchmarks.cli import app
+
+        app(prog_name="lagros")
+    except ModuleNotFoundError as error:
+        hint = install_hint(error)
+        if not hint:
+            raise
+        sys.exit(f"lagros: {error}{hint}")
+
+
+if __name__ == "__main__":
+    main()
