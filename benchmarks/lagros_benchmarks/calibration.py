@@ -6,14 +6,17 @@ that no figure comes from an episode on which a policy was trained or is judged.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import lagros_policies
 from lagros_benchmarks.spacecraft_episodes import fly_chunk
 from lagros_benchmarks.worst_case.cartpole import (
     Episodes,
@@ -38,6 +41,8 @@ FloatArray = NDArray[np.float64]
 # Episodes that fly in one batch.
 _CHUNK = 500
 _WORLDS = 25
+# Hexadecimal digits of a hash in the name of a file.
+_DIGITS = 12
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,30 @@ class EpisodeScores:
     values: dict[str, FloatArray]
     failed: int
     seconds: float
+
+
+def pretrained_hash(task: str, *settings: object, folder: Path | None = None) -> str:
+    """Return a short hash of the weights and metrics of a task, for the names of kept flights.
+
+    Whoever trains a network or designs a metric anew gets flights of the new one: nothing that was
+    flown with the old one is found under the new name.
+
+    Args:
+        task: "cartpole" or "spacecraft"; all networks of the task count, whichever of them fly.
+        settings: What else the flights depend on, each with a `repr` that says all of it.
+        folder: Where the files lie; that of the shipped ones if None.
+
+    Returns:
+        Twelve hexadecimal digits.
+    """
+    folder = folder or Path(lagros_policies.__file__).parent / "pretrained"
+    networks = folder.glob(f"{task}_*.safetensors")
+    files = sorted([*networks, *folder.glob(f"{task}_*metric.json")])
+    digest = hashlib.sha256(repr(settings).encode())
+    for file in files:
+        digest.update(f"{file.name}\0".encode())
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()[:_DIGITS]
 
 
 def cartpole_scores(
@@ -248,9 +277,9 @@ def _statements(
     kinds: Sequence[Score], scores: EpisodeScores, level: float, where: str
 ) -> list[Statement]:
     bounds = [(one, conformal_bound(scores.values[one.name], level)) for one in kinds]
-    return [
-        bound_statement(one.what, one.unit, bound, where, scores.seconds) for one, bound in bounds
-    ]
+    # All bounds are of the same flights: each line carries its share of their time.
+    share = scores.seconds / len(bounds)
+    return [bound_statement(one.what, one.unit, bound, where, share) for one, bound in bounds]
 
 
 def _where(kind: str, bound: float) -> str:

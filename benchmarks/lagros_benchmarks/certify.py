@@ -245,12 +245,14 @@ def _numbers(found: Certificate) -> Table:
     region = ", ".join(
         f"{name} {low:.4g}..{high:.4g}" for name, (low, high) in found.region.items()
     )
-    tube = found.tube
+    if found.task == "spacecraft":
+        region = f"all states; to draw from: {region}"
+    tube, terms = found.tube, len(found.coefficients)
     rows = {
         "region": region,
         "α [1/s]": f"{found.alpha:.6g}",
         "χ": at_most(found.chi, 6),
-        "ν": f"{found.nu:.6g}",
+        "ν": at_most(found.nu, 6),
         "b̄": at_most(found.b_bar, 6),
         "ε_ℓ": f"{found.epsilon_l:.6g} (observed)",
         "d̄": f"{found.d_bar:g}",
@@ -259,7 +261,7 @@ def _numbers(found: Certificate) -> Table:
         if tube.certified is None
         else f"{at_most(tube.certified)} ({_CHANNELS[found.channels]})",
         "tube, observed": "not flown" if tube.observed is None else f"{tube.observed:.4g}",
-        "W̄(x)": f"{len(found.coefficients)} coefficients of {found.basis}",
+        "W̄(x)": f"{terms} coefficient{'s' * (terms != 1)} of {found.basis}",
     }
     for name, value in rows.items():
         table.add_row(Text(name), Text(value))

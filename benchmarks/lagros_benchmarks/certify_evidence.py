@@ -19,6 +19,7 @@ from lagros_policies.contraction.certificate import Certificate
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.double_integrator import AxisMetric
 from lagros_policies.contraction.held_design import HeldDesign, HeldTube, design_held_contained
+from lagros_policies.contraction.metric import number
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.statement import Statement
 from lagros_policies.contraction.theorems import contraction_distance
@@ -92,13 +93,21 @@ def load_axis_metric(path: Path | None, rate: float, period: float) -> AxisMetri
     if path is None:
         return design_axis(rate, period)
     try:
-        record = json.loads(path.read_text())
+        text = path.read_bytes().decode()
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"{path} is no JSON: the spacecraft's metric is one of its axes, a file with format "
+            f"{AXIS_FORMAT!r}, rate, stiffness and period; a network is not proved"
+        ) from error
+    try:
+        record = json.loads(text)
         if record["format"] != AXIS_FORMAT:
             raise ValueError(f"format {record['format']!r} is not {AXIS_FORMAT!r}")
         names = ("rate", "stiffness", "period")
-        return AxisMetric(**{name: float(record[name]) for name in names})
+        return AxisMetric(**{name: number(record, name) for name in names})
     except (KeyError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
-        raise ValueError(f"{path} is not a metric of the spacecraft's axes: {error}") from error
+        reason = f"it has no {error}" if isinstance(error, KeyError) else error
+        raise ValueError(f"{path} is not a metric of the spacecraft's axes: {reason}") from error
 
 
 def cartpole_tubes(system: CartPole, bound: float) -> list[ConstantTube]:

@@ -9,6 +9,8 @@ fresh episodes. Beside it the coverage averaged over random splits of all episod
     python benchmarks/studies/conformal.py [--json FILE]
 
 Scores are kept in runs/conformal/ and a call that was interrupted goes on; `--fresh` begins anew.
+The files are named by a hash of the task's weights and metrics too: what was flown with a network
+of before is not taken for one that was trained again.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from lagros_benchmarks.calibration import (
     EpisodeScores,
     Score,
     cartpole_scores,
+    pretrained_hash,
     spacecraft_scores,
 )
 from lagros_benchmarks.files import write_json
@@ -65,7 +68,8 @@ def scores_of(
     case: dict[str, Any], namespace: int, count: int, folder: Path
 ) -> tuple[EpisodeScores, float]:
     """Return the scores of a case from its file, or fly the episodes and write it."""
-    name = "-".join(str(part) for part in (*case.values(), f"{namespace:x}", count))
+    key = pretrained_hash(case["task"])
+    name = "-".join(str(part) for part in (*case.values(), f"{namespace:x}", count, key))
     path = folder / f"{name}.json"
     if path.is_file():
         record = json.loads(path.read_text())

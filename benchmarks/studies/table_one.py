@@ -162,7 +162,8 @@ def markdown(rows: list[dict[str, Any]], certificate: dict[str, Any]) -> str:
         if row["networks_per_step"]:
             work.append(f"{row['networks_per_step']} network evaluation")
         if row["plans_per_step"]:
-            work.append(f"{row['plans_per_step']:.2g} plans")
+            plans = f"{row['plans_per_step']:.2g}"
+            work.append(f"{plans} plan" if plans == "1" else f"{plans} plans")
         radii = ", ".join(f"{radius:.3g}" for radius in row["bound"])
         near, far = row["distance_to_plan"], row["distance_to_control"]
         cells = (
@@ -205,9 +206,14 @@ def main() -> None:
         rows.append({**row, **bounded(row, certificate)})
     text = markdown(rows, certificate)
     sys.stdout.write(text)
-    names = ("alpha", "chi", "nu", "b_bar", "epsilon_l", "control_error", "d_bar", "channels")
-    names = (*names, "region", "lipschitz")
-    record = {"rows": rows, "certificate": {name: certificate[name] for name in names}}
+    names = (
+        *("alpha", "chi", "nu", "b_bar", "epsilon_l", "control_error", "d_bar", "channels"),
+        *("region", "lipschitz"),
+    )
+    record: dict[str, Any] = {
+        "rows": rows,
+        "certificate": {name: certificate[name] for name in names},
+    }
     record["certificate"]["holds"] = found.holds
     if wanted.json is not None:
         write_atomic(wanted.json, json.dumps(record, indent=1) + "\n")

@@ -3,8 +3,9 @@
     python benchmarks/studies/worst_case.py [--task cartpole|spacecraft] [--json FILE]
 
 Finished attacks are kept in runs/worst_case/ with their sequences (.npz, for `lagros attack TASK
---replay FILE`), and a call that was interrupted goes on; `--fresh` begins anew, as it must after
-networks have been trained again.
+--replay FILE`), and a call that was interrupted goes on. Their names end with a hash of the
+settings and of the task's weights and metrics, so that networks that were trained again are
+attacked again; `--fresh` begins anew whatever was kept.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from lagros_benchmarks.calibration import pretrained_hash
 from lagros_benchmarks.files import plain, write_json
 from lagros_benchmarks.worst_case.attack import AttackSettings, run_attack
 from lagros_benchmarks.worst_case.replay import save_worst_cases
@@ -64,18 +66,19 @@ def attacks(task: str | None) -> list[AttackSettings]:
 
 
 def stem(settings: AttackSettings) -> str:
-    """Return the name of the files of an attack."""
+    """Return an attack in a word, which the names of its files begin with."""
     worn = "+filter" if settings.safety_filter else ""
     return f"{settings.task}-{settings.policy}{worn}-{settings.goal}-{settings.bound:g}"
 
 
 def kept(settings: AttackSettings, fresh: bool) -> dict[str, Any]:
     """Return the row of an attack from its file, or attack and write it."""
-    path = FOLDER / f"attack-{stem(settings)}.json"
+    name = f"{stem(settings)}-{pretrained_hash(settings.task, settings)}"
+    path = FOLDER / f"attack-{name}.json"
     if path.is_file() and not fresh:
         return dict(json.loads(path.read_text()))
     found = run_attack(settings)
-    save_worst_cases(found.cases, FOLDER / f"{stem(settings)}.npz")
+    save_worst_cases(found.cases, FOLDER / f"{name}.npz")
     write_atomic(path, json.dumps(plain(found.row)))
     return dict(plain(found.row))
 

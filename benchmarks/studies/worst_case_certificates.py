@@ -37,6 +37,7 @@ from rich.console import Console
 from rich.table import Table
 from worst_case_tracking import KINDS, SEED, SPACECRAFT_BOUNDS, drawn, spacecraft_case
 
+from lagros_benchmarks.calibration import pretrained_hash
 from lagros_benchmarks.files import plain, write_json
 from lagros_benchmarks.worst_case import cartpole
 from lagros_benchmarks.worst_case.certificate import CertificateTarget, TubeCheck
@@ -59,7 +60,7 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 COMMAND = "python benchmarks/studies/worst_case_certificates.py"
-FOLDER = Path("runs/worst_case")
+FOLDER = Path("runs/worst_case_certificates")
 # Cart-pole, held: scenarios of each case, random draws of each kind for each.
 _HELD = (
     ("tube-mpc", 0.05),
@@ -287,7 +288,10 @@ def part_held() -> list[dict[str, Any]]:
     """Return one row for each policy, bound and way of making disturbances."""
     rows = []
     for policy, bound in _HELD:
-        piece = kept(f"held-{policy}-{bound}", partial(held_case, policy, bound))
+        piece = kept(
+            f"held-{policy}-{bound}-{pretrained_hash('cartpole')}",
+            partial(held_case, policy, bound),
+        )
         about = {"part": "cartpole-held", "policy": policy, "bound": bound}
         rows += [{**about, "made": made, **row} for made, row in piece["rows"].items()]
     return rows
@@ -323,7 +327,9 @@ def part_spacecraft() -> list[dict[str, Any]]:
     """Return one row for each bound and way of making disturbances."""
     rows = []
     for bound in SPACECRAFT_BOUNDS:
-        piece = kept(f"spacecraft-{bound}", partial(spacecraft_case, bound))
+        piece = kept(
+            f"spacecraft-{bound}-{pretrained_hash('spacecraft')}", partial(spacecraft_case, bound)
+        )
         about = {"part": "spacecraft", "policy": "centralized (u*)", "bound": bound}
         rows += [{**about, "made": made, **row} for made, row in piece["rows"].items()]
     return rows

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,7 +204,7 @@ def tube_record(tube: ConstantTube) -> dict[str, object]:
         "contained": tube.contained,
         "largest_d_bar": tube.largest_bound,
         "nu": tube.control_weight,
-        "plan": {name: getattr(tube.plan, name) for name in tube.plan.__dataclass_fields__},
+        "plan": asdict(tube.plan),
         "region": {name: list(ends) for name, ends in region_of(box).items()},
         "W": tube.dual.tolist(),
     }
@@ -224,7 +224,7 @@ def held_record(tube: HeldTube) -> dict[str, object]:
         "outputs": dict(zip(names, tube.steady_outputs.tolist(), strict=True)),
         "deviation": tube.largest_deviation,
         "contained": tube.contained,
-        "plan": {name: getattr(tube.plan, name) for name in tube.plan.__dataclass_fields__},
+        "plan": asdict(tube.plan),
         "region": {name: list(ends) for name, ends in region_of(tube.proof_box).items()},
         "K": tube.gain.tolist(),
         "Q": tube.duals.tolist(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,9 @@ from lagros_policies.contraction.ellipsoid_axis import (
     prove_axis_ellipsoid,
 )
 from lagros_policies.contraction.proof.spacecraft import (
+    contracts_at_will,
     control_square,
+    lies_between,
     prove_axis,
     prove_spacecraft,
 )
@@ -50,7 +53,7 @@ def spacecraft_certificate(
     Args:
         plane: Metric of x and y, with the period of the hold; it serves the heading here too.
         turning: Metric that the tracking law has for the heading.
-        body: The spacecraft.
+        body: The spacecraft, of any mass and arms; its thrusters push as those of `Spacecraft`.
         disturbance_bound: d_bar, in units of the state per second.
         learning_error: eps_l, as an acceleration in the plane [m/s^2].
         paper_radius: What the published tube tends to.
@@ -65,15 +68,21 @@ def spacecraft_certificate(
     square = control_square(body)
     if square is None:
         raise ValueError(f"B B' of {body} is not one diagonal at every heading")
-    gain = math.sqrt(float(max(square)))
+    gain = _root_above(max(square))
     # Thrusters push both ways along each body axis, two at a time.
-    push = 2.0 * math.sqrt(2.0) * thrust / body.mass
+    push = _root_above(8 * (Fraction(thrust) / Fraction(body.mass)) ** 2)
     weight = control_weight(plane, float(min(square)), push)
     dual = whole_dual(plane)
     values = np.linalg.eigvalsh(dual)
     # I <= W_bar: the least eigenvalue is brought to one, with room for its rounding.
     least = float(values[0]) * (1.0 - _ROUNDING)
     chi = prove_axis(plane).condition * (1.0 + 2.0 * _ROUNDING)
+    rate, nu, coefficients = plane.rate * (1.0 - _ROUNDING), weight / least, dual / least
+    # The numbers above are guesses in floats; this decides, in fractions of what is written.
+    block = coefficients[np.ix_([0, _AXES], [0, _AXES])]
+    shown = contracts_at_will(block, rate, nu, min(square), push) and lies_between(
+        block, Fraction(1), Fraction(chi)
+    )
     statements = prove_spacecraft(plane, turning, body)
     watch.lap()
     tube = state_tube(plane, disturbance_bound + learning_error)
@@ -84,15 +93,15 @@ def spacecraft_certificate(
         task="spacecraft",
         policy=policy,
         region=_region(thrust),
-        alpha=plane.rate * (1.0 - _ROUNDING),
+        alpha=rate,
         chi=chi,
-        nu=weight / least,
+        nu=nu,
         b_bar=gain,
         epsilon_l=learning_error / gain,
         d_bar=disturbance_bound,
         channels="all",
         basis="1 (W_bar is constant); the state is [x, y, heading, vx, vy, spin]",
-        coefficients=dual[None] / least,
+        coefficients=coefficients[None],
         tube=TubeSizes(paper_radius, radius),
         statements=(
             *statements,
@@ -100,10 +109,10 @@ def spacecraft_certificate(
                 f"equation (14) for the six states and a control at will, with the nu of this "
                 f"certificate, for every u_d of thrusters up to {thrust:g} N: Schur complement",
                 "proved",
-                weight > 0.0,
+                shown,
                 watch.lap(),
             ),
-            *_tubes(plane, disturbance_bound, learning_error, radius),
+            *_tubes(plane, disturbance_bound, learning_error, radius, shown),
             _lemma(pushed, disturbance_bound, learning_error),
         ),
         details={
@@ -118,13 +127,9 @@ def spacecraft_certificate(
 
 
 def control_weight(metric: AxisMetric, gain: float, push: float) -> float:
-    """Return a nu for which (14) holds for the six states at the metric's own rate.
+    """Return a nu for which (14) holds for the six states at the metric's own rate, in floats.
 
-    With W_bar = [[1, q], [q, s]] per axis and C the derivative of the acceleration by the heading,
-    ||C|| <= push, the left side has the blocks P = 2 (q + alpha) I, Q = (s + 2 alpha q) I + C and
-    R = 2 alpha s I + q (C + C') - 2 nu g: negative by a Schur complement if
-
-        2 nu g > 2 alpha s + 2 |q| push + (|s + 2 alpha q| + push)^2 / (-2 (q + alpha)).
+    It is that of `contracts_at_will`, which proves it in fractions, and a millionth more.
 
     Args:
         metric: The metric, with q < -alpha, which a hold brings about.
@@ -142,6 +147,14 @@ def control_weight(metric: AxisMetric, gain: float, push: float) -> float:
         )
     size = 2.0 * alpha * s + 2.0 * abs(q) * push + (abs(s + 2.0 * alpha * q) + push) ** 2 / room
     return size / (2.0 * gain) * (1.0 + 1e-6)
+
+
+def _root_above(square: Fraction) -> float:
+    """Return a double no less than the root of a fraction: its own where that is a double."""
+    root = math.sqrt(square)
+    while Fraction(root) ** 2 < square:
+        root = math.nextafter(root, math.inf)
+    return root
 
 
 def whole_dual(metric: AxisMetric) -> FloatArray:
@@ -163,16 +176,18 @@ def _region(thrust: float) -> dict[str, tuple[float, float]]:
 
 
 def _tubes(
-    plane: AxisMetric, bound: float, learning_error: float, radius: float
+    plane: AxisMetric, bound: float, learning_error: float, radius: float, contracts: bool
 ) -> list[Statement]:
+    """Return the tubes; `contracts` says whether (14) was shown, which Theorem 1 stands on."""
     watch = Stopwatch()
-    reach = position_tube(plane, bound + learning_error).steady_radius * (1.0 + 2.0 * _ROUNDING)
+    whole = bound + learning_error
+    reach = position_tube(plane, whole).steady_radius * (1.0 + 2.0 * _ROUNDING)
     first = Statement(
         f"Theorem 1, control at will: ||e|| of the plane's four states tends to at most "
         f"{at_most(radius)}, its position error to {at_most(reach)} m, for d_bar = {bound:g} and "
         f"||u_L - u*|| <= {at_most(learning_error)} m/s^2",
         "proved",
-        prove_axis(plane).holds,
+        contracts and _radii_hold(plane, whole, radius, reach),
         watch.lap(),
     )
     margin = certified_margin(plane, bound)
@@ -195,6 +210,22 @@ def _tubes(
         watch.lap(),
     )
     return [first, second, third]
+
+
+def _radii_hold(plane: AxisMetric, push: float, radius: float, reach: float) -> bool:
+    """Return whether both radii are no less than Theorem 1's at the certificate's alpha, exactly.
+
+    Those are sqrt(chi) d_bar / alpha, and d_bar / (alpha sqrt(lambda_min(W))) for the position.
+    """
+    condition = prove_axis(plane).condition
+    if not (math.isfinite(condition) and reach > 0.0):
+        return False
+    steady = (Fraction(push) / Fraction(plane.rate * (1.0 - _ROUNDING))) ** 2
+    # W = [[1, q], [q, s]] is below its trace.
+    least, largest = steady / Fraction(reach) ** 2, 1 + Fraction(plane.stiffness)
+    return Fraction(radius) ** 2 >= Fraction(condition) * steady and lies_between(
+        plane.dual, least, largest
+    )
 
 
 def _ellipsoid_record(period: float) -> dict[str, object]:

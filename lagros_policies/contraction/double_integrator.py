@@ -25,6 +25,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_not_negative, check_positive
 from lagros_policies.contraction.tube import Tube
 
 FloatArray = NDArray[np.float64]
@@ -60,10 +61,8 @@ class AxisMetric:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if not (math.isfinite(self.rate) and self.rate > 0.0):
-            raise ValueError(f"rate={self.rate!r} must be positive and finite")
-        if not (math.isfinite(self.period) and self.period >= 0.0):
-            raise ValueError(f"period={self.period!r} must be finite and >= 0")
+        check_positive("rate", self.rate)
+        check_not_negative("period", self.period)
         if not (math.isfinite(self.stiffness) and self.stiffness > self.coupling**2):
             raise ValueError(
                 f"stiffness={self.stiffness!r} gives no positive definite W at rate={self.rate!r} "
@@ -152,8 +151,7 @@ def design_axis(
     """
     from scipy.optimize import minimize_scalar
 
-    if not (math.isfinite(rate) and rate > 0.0):
-        raise ValueError(f"rate={rate!r} must be positive and finite")
+    check_positive("rate", rate)
     if objective == "state" and period == 0.0 and 1.0 + 2.0 * rate**2 <= stiffness_limit:
         return AxisMetric(rate, 1.0 + 2.0 * rate**2, period)
     low, high = stiffness_range(rate, period)
@@ -256,12 +254,10 @@ def planned_margin(margin: float | None, disturbance_bound: float, rate: float) 
     Raises:
         ValueError: A value is negative or not finite.
     """
-    if not 0.0 <= disturbance_bound < np.inf:
-        raise ValueError(f"disturbance_bound={disturbance_bound!r} must be finite and >= 0")
+    check_not_negative("disturbance_bound", disturbance_bound)
     if margin is None:
         return max(_LEAST_MARGIN, expected_margin(disturbance_bound, rate))
-    if not 0.0 <= margin < np.inf:
-        raise ValueError(f"margin={margin!r} must be finite and >= 0, or None")
+    check_not_negative("margin", margin, "or None")
     return margin
 
 

@@ -21,11 +21,12 @@ hold exactly. As h goes to zero it is the law above.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_positive
 from lagros_envs.dynamics.spacecraft import Spacecraft
 from lagros_policies.contraction.thrusters import held_thrust
 
@@ -33,6 +34,8 @@ FloatArray = NDArray[np.float64]
 
 # What is left of an impulse response after this many steps of the slower mode is nothing.
 _TAIL = 1e-12
+# Above the rounding of a bound, relative.
+_ROUNDING = 1e-8
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +58,8 @@ class SlidingAxis:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name}={value!r} must be positive and finite")
+        for item in fields(self):
+            check_positive(item.name, getattr(self, item.name))
         if self.position_rate * self.period >= 2.0:
             raise ValueError(
                 f"position_rate={self.position_rate!r} times period={self.period!r} must be "
@@ -211,9 +212,8 @@ def hierarchical_bound(
             f"{disturbance_bound=!r}, {steps=!r}, {initial_sliding=!r} and {initial_error=!r} "
             "must be >= 0"
         )
-    h, rate = axis.period, axis.position_rate
-    sliding_push = 0.5 * h * (math.hypot(rate, 1.0) + math.hypot(rate, 1.0 + rate * h))
-    position_push = 0.5 * h * (1.0 + math.hypot(1.0, h))
+    sliding_push, position_push = _pushes(axis)
+    rate = axis.position_rate
     sliding, position = np.empty(steps + 1), np.empty(steps + 1)
     sliding[0], position[0] = initial_sliding, initial_error
     for step in range(steps):
@@ -223,7 +223,8 @@ def hierarchical_bound(
             + axis.coupling * sliding[step]
             + position_push * disturbance_bound
         )
-    return HierarchicalBound(sliding, position, sliding + rate * position)
+    above = 1.0 + _ROUNDING
+    return HierarchicalBound(above * sliding, above * position, above * (sliding + rate * position))
 
 
 def steady_position_bound(axis: SlidingAxis, disturbance_bound: float) -> float:
@@ -232,12 +233,14 @@ def steady_position_bound(axis: SlidingAxis, disturbance_bound: float) -> float:
     Between instants the position leaves the chord of its ends by at most h^2/8 of the deviation and
     (h/2 + h^2/8) d_bar, as in `double_integrator.certified_margin`.
     """
-    slowest = max(axis.sliding_factor, axis.position_factor)
-    steps = math.ceil(2.0 * math.log(_TAIL) / math.log(slowest))
-    bound = hierarchical_bound(axis, disturbance_bound, steps)
-    return float(bound.position[-1]) + _between(
-        axis, float(bound.sliding[-1]), float(bound.position[-1]), disturbance_bound
-    )
+    sliding_push, position_push = _pushes(axis)
+    # What the bounds at the instants rise to, from zero: the fixed point of their recursion.
+    sliding = sliding_push * disturbance_bound / -math.expm1(-axis.sliding_rate * axis.period)
+    ahead = axis.position_rate * axis.period
+    position = (axis.coupling * sliding + position_push * disturbance_bound) * (2.0 + ahead)
+    position /= 2.0 * ahead  # 1 - rho_q = 2 lambda h / (2 + lambda h)
+    between = _between(axis, sliding, position, disturbance_bound)
+    return (position + between) * (1.0 + _ROUNDING)
 
 
 def peak_position_error(axis: SlidingAxis, disturbance_bound: float) -> float:
@@ -259,6 +262,13 @@ def peak_position_error(axis: SlidingAxis, disturbance_bound: float) -> float:
         if float(np.linalg.norm(effect)) < _TAIL * total:
             return total * disturbance_bound
         effect = step @ effect
+
+
+def _pushes(axis: SlidingAxis) -> tuple[float, float]:
+    """Return what one hold of a unit disturbance adds to ||s|| and to ||q~||, at most."""
+    h, rate = axis.period, axis.position_rate
+    sliding = 0.5 * h * (math.hypot(rate, 1.0) + math.hypot(rate, 1.0 + rate * h))
+    return sliding, 0.5 * h * (1.0 + math.hypot(1.0, h))
 
 
 def _between(axis: SlidingAxis, sliding: float, position: float, disturbance: float) -> float:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_at_least, check_positive
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_envs.files import write_atomic
 
@@ -19,6 +20,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _FORMAT = "lagros-metric-1"
+_NETWORK = ".safetensors"
 
 
 @dataclass(frozen=True)
@@ -50,10 +52,8 @@ class Region:
 
     def __post_init__(self) -> None:
         """Check the bounds."""
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name}={value!r} must be positive and finite")
+        for item in fields(self):
+            check_positive(item.name, getattr(self, item.name))
         if self.angle >= math.pi / 2:
             raise ValueError(
                 f"angle={self.angle!r} must be below pi/2, where the force loses its authority"
@@ -180,8 +180,7 @@ class Metric:
             np.all(np.isfinite(self.coefficients)) and all(0.0 < n < math.inf for n in numbers)
         ):
             raise ValueError("W_bar must be finite; alpha, chi, nu and scaling finite and positive")
-        if self.condition_bound < 1.0:
-            raise ValueError(f"condition_bound={self.condition_bound!r} must be at least 1")
+        check_at_least("condition_bound", self.condition_bound, 1)
 
     @property
     def degree(self) -> int:
@@ -275,17 +274,90 @@ def design_arguments(record: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         KeyError: An entry is missing.
         TypeError: An entry has a wrong type.
-        ValueError: A number is out of range.
+        ValueError: A number is out of range, or is text or true or false.
     """
     check = record["verification"]
+    only_numbers(record["region"], "region")
+    if check is not None:
+        only_numbers(check, "verification")
     return {
-        "contraction_rate": float(record["alpha"]),
-        "condition_bound": float(record["chi"]),
-        "control_weight": float(record["nu"]),
-        "scaling": np.array(record["scaling"], dtype=np.float64),
+        "contraction_rate": number(record, "alpha"),
+        "condition_bound": number(record, "chi"),
+        "control_weight": number(record, "nu"),
+        "scaling": numbers(record, "scaling"),
         "region": Region(**record["region"]),
         "verification": None if check is None else Verification(**check),
     }
+
+
+def number(record: Mapping[str, Any], name: str) -> float:
+    """Return a number of a JSON object; text and true, which Python takes for one, are refused.
+
+    Args:
+        record: The object.
+        name: Key of the number.
+
+    Raises:
+        KeyError: There is no such key.
+        ValueError: It is no number.
+    """
+    value = record[name]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{name}={value!r} must be a number: write it without quotes")
+    return float(value)
+
+
+def numbers(record: Mapping[str, Any], name: str) -> FloatArray:
+    """Return nested lists of numbers of a JSON object as an array; see `number`.
+
+    Raises:
+        KeyError: There is no such key.
+        ValueError: An entry is no number, or the lists are of different lengths.
+    """
+    only_numbers(record[name], name)
+    return np.array(record[name], dtype=np.float64)
+
+
+def only_numbers(value: Any, name: str) -> None:
+    """Refuse text, true, false and null anywhere inside lists and objects of JSON.
+
+    Args:
+        value: What JSON was read to.
+        name: What it is called in the message.
+
+    Raises:
+        ValueError: There is one.
+    """
+    if isinstance(value, Mapping | list):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            only_numbers(item, name)
+    elif isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{name} holds {value!r}, which must be a number: write it without quotes")
+
+
+def read_text(path: Path | str) -> str:
+    """Return the text of a metric's file, which is JSON; a network is refused by name.
+
+    Args:
+        path: The file.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is a network, or no text.
+    """
+    data = Path(path).read_bytes()
+    try:
+        text = data.decode()
+    except UnicodeDecodeError:
+        text = ""
+    if Path(path).suffix == _NETWORK or (data and not text):
+        raise ValueError(
+            f"{path} is no JSON: a network is neither read nor proved here, only a polynomial is. "
+            "Give a file of save_metric, as `python -m lagros_policies.contraction.proof.design "
+            "--out FILE` writes; for networks there is load_neural_metric, and their condition is "
+            "checked on samples"
+        )
+    return text
 
 
 def save_metric(metric: Metric, path: Path | str) -> None:
@@ -304,15 +376,16 @@ def load_metric(path: Path | str | None = None) -> Metric:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is not a metric, or is damaged.
+        ValueError: The file is not a metric, is a network, or is damaged.
     """
     if path is None:
         path = Path(__file__).parents[1] / "pretrained" / "cartpole_metric.json"
+    text = read_text(path)
     try:
-        record = json.loads(Path(path).read_text())
+        record = json.loads(text)
         if record["format"] != _FORMAT:
             raise ValueError(f"format {record['format']!r} is not {_FORMAT!r}")
-        coefficients = np.array(record["coefficients"], dtype=np.float64)
-        return Metric(coefficients, **design_arguments(record))
+        return Metric(numbers(record, "coefficients"), **design_arguments(record))
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise ValueError(f"{path} is not a metric written by save_metric: {error}") from error
+        reason = f"it has no {error}" if isinstance(error, KeyError) else error
+        raise ValueError(f"{path} is not a metric written by save_metric: {reason}") from error

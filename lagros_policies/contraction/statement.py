@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from decimal import ROUND_CEILING, Context
 from typing import Literal, get_args
 
+from lagros_envs.checks import check_not_negative
+
 Kind = Literal["proved", "calibrated", "observed"]
 
 
@@ -37,8 +39,7 @@ class Statement:
             raise ValueError("text='' must say what is claimed")
         if self.kind not in get_args(Kind):
             raise ValueError(f"kind={self.kind!r} must be one of {', '.join(get_args(Kind))}")
-        if not (math.isfinite(self.seconds) and self.seconds >= 0.0):
-            raise ValueError(f"seconds={self.seconds!r} must be finite and >= 0")
+        check_not_negative("seconds", self.seconds)
 
 
 def at_most(value: float, digits: int = 4) -> str:

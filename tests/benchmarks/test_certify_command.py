@@ -116,6 +116,10 @@ _EYE = np.eye(4).tolist()
             "symmetric",
             id="almost symmetric",
         ),
+        pytest.param("cartpole", {"alpha": "0.5"}, "alpha='0.5' must be a number", id="text"),
+        pytest.param("cartpole", {"alpha": True}, "alpha=True must be a number", id="true"),
+        pytest.param("spacecraft", {"rate": "1.0"}, "rate='1.0' must be a number", id="axis, text"),
+        pytest.param("spacecraft", {"rate": True}, "rate=True must be a number", id="axis, true"),
         pytest.param("spacecraft", {"rate": 10**400}, "is not a metric", id="axis, enormous"),
         pytest.param("spacecraft", {"stiffness": 1e308}, "is not a metric", id="axis, overflow"),
         pytest.param("spacecraft", {"period": float("nan")}, "is not a metric", id="axis, nan"),
@@ -132,6 +136,23 @@ def test_hostile_numbers_give_status_one_and_say_what_is_wrong(
     assert isinstance(result.exception, SystemExit)
     assert message in " ".join(result.output.split())
     assert "bad.json" in result.output
+
+
+@pytest.mark.parametrize("task", ["cartpole", "spacecraft"])
+def test_a_network_is_not_proved_and_the_message_says_what_is(invoke, tmp_path, task):
+    from pathlib import Path
+
+    import lagros_policies
+
+    shipped = Path(lagros_policies.__file__).parent / "pretrained"
+    network = (shipped / "cartpole_neural_metric.safetensors").read_bytes()
+    (tmp_path / "net.safetensors").write_bytes(network)
+    result = invoke(task, "--metric", "net.safetensors", "--episodes", "0")
+    words = " ".join(result.output.split())
+    assert result.exit_code == 1
+    assert "net.safetensors is no JSON" in words
+    assert "codec" not in words
+    assert ("only a polynomial" if task == "cartpole" else "stiffness and period") in words
 
 
 def test_nested_brackets_without_end_are_no_metric(invoke, tmp_path):
@@ -251,6 +272,23 @@ def system_of_task():
     from lagros_envs.cartpole_task import CartPoleSettings
 
     return CartPoleSettings().system
+
+
+def test_flights_that_serve_several_bounds_are_timed_once(monkeypatch):
+    from lagros_benchmarks import calibration
+
+    values = {one.name: np.arange(40.0) for one in calibration.CARTPOLE_SCORES}
+    scores = calibration.EpisodeScores(values, 0, 6.0)
+    monkeypatch.setattr(calibration, "cartpole_scores", lambda *_, **__: scores)
+    lines = calibration.cartpole_statements(0.95, 40)
+    assert len(lines) == 3
+    assert sum(line.seconds for line in lines) == pytest.approx(6.0)
+
+
+def test_the_spacecraft_s_region_is_printed_as_all_states(invoke):
+    words = " ".join(invoke("spacecraft", "--episodes", "0").stdout.split())
+    assert "region all states; to draw from: x -1000..1000" in words
+    assert "1 coefficient of 1" in words
 
 
 def test_markup_in_a_claim_is_printed_as_it_is(capsys):

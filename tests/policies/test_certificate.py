@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lagros_envs.dynamics import Spacecraft, jacobian
-from lagros_policies.contraction import load_metric
+from lagros_policies.contraction import certificate_spacecraft, load_metric
 from lagros_policies.contraction.certificate_cartpole import (
     CartPoleQuestion,
     cartpole_certificate,
@@ -32,8 +32,7 @@ def cartpole(system):
     return cartpole_certificate(system, load_metric(), question)
 
 
-@pytest.fixture(scope="module")
-def spacecraft():
+def spacecraft_of_task():
     return spacecraft_certificate(
         design_axis(2.0),
         design_axis(0.3),
@@ -42,6 +41,11 @@ def spacecraft():
         learning_error=0.5,
         paper_radius=0.125,
     )
+
+
+@pytest.fixture(scope="module")
+def spacecraft():
+    return spacecraft_of_task()
 
 
 @pytest.mark.parametrize("name", ["cartpole", "spacecraft"])
@@ -140,6 +144,34 @@ def test_an_outsider_checks_the_spacecraft_at_random_states(spacecraft):
     # The nu is needed: the heading's terms would break a hundredth of it.
     left += 2 * 0.99 * record["nu"] * gain @ np.swapaxes(gain, 1, 2)
     assert np.linalg.eigvalsh(left).max() > 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "text"),
+    [
+        ("control_weight", lambda found: 0.9 * found, "equation (14)"),
+        ("state_tube", lambda found: replace(found, condition=0.99 * found.condition), "Theorem 1"),
+        (
+            "position_tube",
+            lambda found: replace(found, condition=0.99 * found.condition),
+            "Theorem 1",
+        ),
+    ],
+)
+def test_a_number_of_the_spacecraft_that_is_too_small_is_not_claimed(
+    monkeypatch, name, spoil, text
+):
+    whole = getattr(certificate_spacecraft, name)
+    monkeypatch.setattr(certificate_spacecraft, name, lambda *arguments: spoil(whole(*arguments)))
+    failed = [line.text for line in spacecraft_of_task().statements if not line.holds]
+    assert any(line.startswith(text) for line in failed)
+
+
+def test_a_metric_of_the_spacecraft_that_is_scaled_too_far_down_is_not_claimed(monkeypatch):
+    """I <= W_bar fails by a millionth: seen by fractions, where a printed digit shows nothing."""
+    monkeypatch.setattr(certificate_spacecraft, "_ROUNDING", -1e-6)
+    failed = [line.text for line in spacecraft_of_task().statements if not line.holds]
+    assert any(line.startswith("equation (14)") for line in failed)
 
 
 def test_a_claim_that_fails_and_a_certificate_without_claims_do_not_hold(spacecraft):

@@ -250,6 +250,8 @@ def test_every_pair_of_angles_lies_in_a_cell_that_counts(system):
     box = ProofBox(0.4, 1.0, 1.5, 2.0, angle_error=0.1, angular_rate_error=0.5)
     condition = LiftedCondition(system, box, np.eye(5), exact(np.zeros((5, 5))))
     cells = grid(np.array([0.0, -0.4]), np.array([0.4, 0.4]), (16, 32))
+    # Cells whose edges do not meet the bound of the error.
+    fine = grid(np.array([0.0, -0.4]), np.array([0.4, 0.4]), (83, 171))
     start = condition.start()
     assert np.all(start.lower.min(axis=0) == [0.0, -0.4])
     assert np.all(start.upper.max(axis=0) == 0.4)
@@ -257,7 +259,7 @@ def test_every_pair_of_angles_lies_in_a_cell_that_counts(system):
     angle = np.clip(rng.uniform(0.0, 0.5, 2000), 0.0, 0.4)
     other = np.clip(angle + np.clip(rng.uniform(-0.15, 0.15, 2000), -0.1, 0.1), -0.4, 0.4)
     place = np.stack([angle, other], axis=1)
-    for some in (start, cells):
+    for some in (start, cells, fine):
         counts = some[~condition.examine(some).empty]
         inside = (counts.lower - 1e-9 <= place[:, None]) & (place[:, None] <= counts.upper + 1e-9)
         assert np.all(np.any(np.all(inside, axis=2), axis=1))

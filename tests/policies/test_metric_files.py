@@ -2,10 +2,12 @@
 
 import json
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import lagros_policies
 from lagros_policies.contraction import (
     Metric,
     Verification,
@@ -101,6 +103,17 @@ def test_foreign_file_is_refused_by_name(tmp_path, content):
         ("alpha", float("nan")),
         ("alpha", -0.5),
         ("alpha", "fast"),
+        ("alpha", "0.5"),
+        ("alpha", True),
+        ("chi", "300"),
+        ("nu", True),
+        ("coefficients", [[["1.0"] * 4] * 4]),
+        ("coefficients", [[[True] * 4] * 4]),
+        ("scaling", ["1", "1", "1", "1"]),
+        ("scaling", [True, 1.0, 1.0, 1.0]),
+        ("region", {"angle": "1.0"}),
+        ("region", {"angle": True}),
+        ("verification", {"samples": "3", "violations": 0, "worst": -1.0, "seed": 0}),
         ("alpha", None),
         ("chi", float("inf")),
         ("chi", 0.5),
@@ -124,6 +137,25 @@ def test_damaged_entry_is_refused_by_name(saved, key, value):
         load_metric(path)
 
 
+@pytest.mark.parametrize("value", ["0.5", True])
+def test_text_in_a_number_s_place_is_named_with_the_remedy(saved, value):
+    _, path = saved
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps({**record, "alpha": value}))
+    with pytest.raises(ValueError, match=r"alpha=.* must be a number: write it without quotes"):
+        load_metric(path)
+
+
+def test_a_network_is_refused_with_what_to_give_in_its_place(tmp_path):
+    shipped = Path(lagros_policies.__file__).parent / "pretrained"
+    network = (shipped / "cartpole_neural_metric.safetensors").read_bytes()
+    files = {"net.safetensors": network, "net.json": network, "text.safetensors": b"{}"}
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(ValueError, match=rf"{name} is no JSON: a network .* save_metric"):
+            load_metric(tmp_path / name)
+
+
 @pytest.mark.parametrize(
     "key", ["format", "coefficients", "alpha", "chi", "nu", "scaling", "region", "verification"]
 )
@@ -132,7 +164,7 @@ def test_missing_entry_is_refused_by_name(saved, key):
     record = json.loads(path.read_text())
     del record[key]
     path.write_text(json.dumps(record))
-    with pytest.raises(ValueError, match=path.name):
+    with pytest.raises(ValueError, match=f"{path.name} .* it has no '{key}'"):
         load_metric(path)
 
 

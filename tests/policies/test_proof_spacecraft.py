@@ -136,3 +136,58 @@ def test_the_exponential_is_bounded_from_below_closely(argument):
     with mpmath.workdps(60):
         value = mpmath.mpf(found.numerator) / found.denominator
         assert value <= mpmath.exp(-mpmath.mpf(argument))
+
+
+def six_states(block, weight, gain, slope, alpha=2.0):
+    """Return the left side of (14) of the six states, less -2 alpha W, for a block (2, 2) of W."""
+    dual = np.kron(block, np.eye(3))
+    a = np.zeros((6, 6))
+    a[:3, 3:], a[3:, :3] = np.eye(3), slope
+    b = np.diag([0.0] * 3 + [gain] * 3)
+    return a @ dual + dual @ a.T - 2.0 * weight * b + 2.0 * alpha * dual
+
+
+@given(st.integers(0, 2**31), st.floats(0.2, 5.0))
+def test_a_weight_that_is_shown_contracts_for_any_slope_of_the_acceleration(seed, size):
+    """By the eigenvalues of the whole matrix, where the proof is by blocks."""
+    rng = np.random.default_rng(seed)
+    block = size * design_axis(2.0).dual
+    push = float(rng.uniform(0.0, 3.0))
+    low, high = 0.0, 1e6
+    while high - low > 1e-6 * high:
+        middle = 0.5 * (low + high)
+        if module.contracts_at_will(block, 2.0, middle, Fraction(2), push):
+            high = middle
+        else:
+            low = middle
+    slopes = rng.standard_normal((200, 3, 3))
+    slopes *= push / np.linalg.norm(slopes, 2, axis=(-2, -1))[:, None, None]
+    ends = [push * sign * np.eye(3) for sign in (-1.0, 1.0)]
+    for slope in (*slopes, *ends):
+        assert np.linalg.eigvalsh(six_states(block, high, 2.0, slope))[-1] < 1e-9
+
+
+def test_the_weight_is_decided_to_the_last_bit():
+    """W = [[1, -1], [-1, 3]], alpha = 1/2, g = 1, c = 0: 2 nu > 3 + 2^2 / 1, in closed form."""
+    block = np.array([[1.0, -1.0], [-1.0, 3.0]])
+    assert not module.contracts_at_will(block, 0.5, 3.5, Fraction(1), 0.0)
+    assert module.contracts_at_will(block, 0.5, math.nextafter(3.5, 4.0), Fraction(1), 0.0)
+    # W = [[1, -1], [-1, 3/2]], alpha = 3/4, C = -I: 2 nu > 9/4 + 2 + 1^2 / (1/2) is the matrix
+    # itself, and no bound of it.
+    block, slope = np.array([[1.0, -1.0], [-1.0, 1.5]]), -np.eye(3)
+    assert not module.contracts_at_will(block, 0.75, 3.125, Fraction(1), 1.0)
+    assert module.contracts_at_will(block, 0.75, math.nextafter(3.125, 4.0), Fraction(1), 1.0)
+    assert np.linalg.eigvalsh(six_states(block, 3.12, 1.0, slope, 0.75))[-1] > 0.0
+    assert np.linalg.eigvalsh(six_states(block, 3.13, 1.0, slope, 0.75))[-1] < 0.0
+    # At q = -alpha there is no finite nu, and a negative W is none.
+    block = np.array([[1.0, -1.0], [-1.0, 3.0]])
+    assert not module.contracts_at_will(block, 1.0, 1e300, Fraction(1), 0.0)
+    assert not module.contracts_at_will(-block, 0.5, 1e300, Fraction(1), 0.0)
+
+
+def test_the_bounds_of_w_are_decided_to_the_last_bit():
+    block = np.array([[3.0, 1.0], [1.0, 3.0]])
+    hair = Fraction(1, 2**200)
+    assert module.lies_between(block, Fraction(2), Fraction(4))
+    assert not module.lies_between(block, 2 + hair, Fraction(4))
+    assert not module.lies_between(block, Fraction(2), 4 - hair)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+
+from lagros_envs.checks import check_not_negative
 
 
 @dataclass(frozen=True)
@@ -37,10 +39,8 @@ class ProofBox:
 
     def __post_init__(self) -> None:
         """Check the bounds."""
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name}={value!r} must be finite and >= 0")
+        for item in fields(self):
+            check_not_negative(item.name, getattr(self, item.name))
         if self.angle >= math.pi / 2:
             raise ValueError(f"angle={self.angle!r} must be below pi/2")
 
@@ -53,5 +53,5 @@ class ProofBox:
 
     def scaled(self, factor: float) -> ProofBox:
         """Return the box with every bound but the lean times a factor."""
-        names = [name for name in self.__dataclass_fields__ if name != "lean"]
+        names = [item.name for item in fields(self) if item.name != "lean"]
         return replace(self, **{name: factor * getattr(self, name) for name in names})

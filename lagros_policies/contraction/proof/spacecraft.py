@@ -18,9 +18,14 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lagros_envs.dynamics.spacecraft import HEADING, VELOCITY_X, Spacecraft
 from lagros_policies.contraction.double_integrator import AxisMetric
 from lagros_policies.contraction.statement import Statement, at_most
+
+FloatArray = NDArray[np.float64]
 
 # The condition of an optimal metric is an equality, which rounding may miss by one unit in the last
 # place; it is proved for a rate that is less by this share.
@@ -135,6 +140,52 @@ def prove_spacecraft(
         holds = proof.holds and square is not None
         statements.append(Statement(text, "proved", holds, seconds))
     return statements
+
+
+def contracts_at_will(
+    dual: FloatArray, rate: float, weight: float, gain: Fraction, push: float
+) -> bool:
+    """Return whether (14) is shown for the six states, in the numbers as they are written.
+
+    With W = [[a, q], [q, s]] for every axis and C the derivative of the acceleration by the
+    heading, ||C|| <= c, the left side of (14), with 2 alpha W brought over, has the blocks
+    P = 2 (q + alpha a) I, Q = (s + 2 alpha q) I + a C and R = 2 alpha s I + q (C + C') - 2 nu g:
+    negative definite by a Schur complement if P is and
+
+        2 nu g > 2 alpha s + 2 |q| c + (|s + 2 alpha q| + a c)^2 / (-2 (q + alpha a)).
+
+    Args:
+        dual: W, shape (2, 2).
+        rate: alpha [1/s].
+        weight: nu.
+        gain: The least entry g of B B'.
+        push: c, a bound of the acceleration of u_d at every heading.
+    """
+    alpha, bound = Fraction(rate), Fraction(push)
+    first, coupling, stiffness = _entries(dual)
+    room = -2 * (coupling + alpha * first)
+    if room <= 0 or first <= 0:
+        return False
+    mixed = abs(stiffness + 2 * alpha * coupling) + first * bound
+    size = 2 * alpha * stiffness + 2 * abs(coupling) * bound + mixed**2 / room
+    return 2 * Fraction(weight) * gain > size
+
+
+def lies_between(dual: FloatArray, low: Fraction, high: Fraction) -> bool:
+    """Return whether low I <= W <= high I, exactly, for a symmetric W of shape (2, 2)."""
+    first, coupling, stiffness = _entries(dual)
+
+    def semidefinite(one: Fraction, other: Fraction) -> bool:
+        return one >= 0 and other >= 0 and one * other >= coupling**2
+
+    return semidefinite(first - low, stiffness - low) and semidefinite(
+        high - first, high - stiffness
+    )
+
+
+def _entries(dual: FloatArray) -> tuple[Fraction, Fraction, Fraction]:
+    first, coupling, stiffness = (Fraction(float(dual[i, j])) for i, j in ((0, 0), (0, 1), (1, 1)))
+    return first, coupling, stiffness
 
 
 class _Circle:
