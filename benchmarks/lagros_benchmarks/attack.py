@@ -5,14 +5,13 @@ Only the standard library, typer and `terminal` are imported here; the command i
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lagros_benchmarks.terminal import fail
+from lagros_benchmarks.terminal import fail, find_users_modules
 
 if TYPE_CHECKING:
     from lagros_benchmarks.worst_case.attack import AttackSettings
@@ -77,7 +76,9 @@ def attack(
     ] = None,
 ) -> None:
     """Search the worst bounded disturbance, fly it, and hold the certificate against it."""
-    sys.path.insert(0, os.getcwd())
+    from lagros_benchmarks.library import SetupError
+
+    find_users_modules()
     try:
         if replay is not None:
             _replay(task, replay)
@@ -92,7 +93,7 @@ def attack(
         fail(f"there is no file {error.filename}; --npz of an earlier attack writes one")
     except (ValueError, OSError) as error:
         fail(error)
-    except ImportError as error:
+    except (ImportError, SetupError) as error:
         fail(error, status=1)
 
 

@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 FORMATS = (".png", ".pdf", ".svg")
-BLACK = "#000000"
+BLACK = "#000000"  # of the tubes; no policy has it
 LONGEST_LABEL = 24  # of a policy in a figure
 _DOTS_PER_INCH = 150
+_LONG_RANGE = 1e3  # of a logarithmic ordinate, from which only powers of ten are labelled
 
 
 class Style(NamedTuple):
@@ -43,19 +44,23 @@ _STYLES = {
     "centralized": Style("#333333", (0, (1, 1)), "^"),
     "lqr": Style("#009E73", (0, (1, 1.2)), "^"),
     "ppo": Style("#CC79A7", (0, (8, 2, 1, 2, 1, 2)), "v"),
+    "sac": Style("#56B4E9", (0, (6, 1)), "P"),
+    "td3": Style("#B8860B", (0, (3, 1, 1, 1)), "X"),
+    "residual": Style("#882255", (0, (4, 4)), "*"),
     "random": Style("#999999", (0, (2, 3)), "x"),
 }
+# Policies of the user's own.
 _OTHERS = (
-    Style("#56B4E9", (0, (6, 1)), "P"),
-    Style("#B8860B", (0, (3, 1, 1, 1)), "X"),
-    Style("#000000", (0, (4, 4)), "*"),
-    Style("#882255", (0, (1, 3)), "<"),
-    Style("#44AA99", (0, (9, 3)), ">"),
+    Style("#6B4423", (0, (9, 3)), ">"),
+    Style("#332288", (0, (1, 3)), "<"),
+    Style("#999933", (0, (7, 1, 1, 1)), "p"),
+    Style("#44AA99", (0, (3, 3)), "h"),
+    Style("#AA4499", (0, (9, 2, 3, 2)), "d"),
 )
 
 
 def styles(policies: Sequence[str]) -> dict[str, Style]:
-    """Return a style for each policy; a known name always looks the same."""
+    """Return a style for each policy; a known name looks the same in every figure."""
     strangers = [name for name in policies if name not in _STYLES]
     found = {name: _OTHERS[index % len(_OTHERS)] for index, name in enumerate(strangers)}
     return {name: _STYLES[name] if name in _STYLES else found[name] for name in policies}
@@ -103,6 +108,22 @@ def canvas(
         axes.grid(axis="y", color="#DDDDDD", linewidth=0.6)
         axes.set_axisbelow(True)
     return figure, panels
+
+
+def log_ordinate(axes: Axes) -> None:
+    """Make an ordinate logarithmic, with labels that are plain numbers: 0.5, 1, 2.
+
+    Matplotlib's own label every mark of a short range, as 6×10⁰.
+    """
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_yscale("log", nonpositive="mask")
+    low, high = axes.get_ylim()
+    marks = (1.0, 2.0, 5.0) if high < _LONG_RANGE * low else (1.0,)
+    axes.yaxis.set_major_locator(LogLocator(subs=marks))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_locator(LogLocator(subs="all"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def curve(values: Any) -> FloatArray:

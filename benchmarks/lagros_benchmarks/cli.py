@@ -6,8 +6,6 @@ inside it, so that `lagros --help` answers at once.
 
 from __future__ import annotations
 
-import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,6 +17,7 @@ from lagros_benchmarks.data import data
 from lagros_benchmarks.export import export
 from lagros_benchmarks.terminal import (
     fail,
+    find_users_modules,
     listed,
     listed_or_none,
     progress_bar,
@@ -148,8 +147,7 @@ def bench(
     from lagros_policies.backends import Backend
 
     outputs = Outputs(json, csv, latex, markdown, figure, episodes_file, scene, scene_world)
-    # A policy of the user's own, module:Class, lies in the folder that lagros is run from.
-    sys.path.insert(0, os.getcwd())
+    find_users_modules()
     try:
         check_task(task)
         if replan_every is not None and task != "cartpole":
@@ -237,13 +235,14 @@ def reproduce(
 
 def _reproduction(task: str, episodes: int | None, jobs: int, backend: Backend) -> Reproduction:
     """Return what a task's run makes."""
+    asked: dict[str, Any] = {"jobs": jobs, "backend": backend}
     if task == "cartpole":
         from lagros_benchmarks.reproduce import ReproduceSettings
 
-        return ReproduceSettings(jobs=jobs, episodes=episodes or 50, backend=backend)
+        return ReproduceSettings(**asked | ({} if episodes is None else {"episodes": episodes}))
     from lagros_benchmarks.reproduce_spacecraft import SpacecraftReproduceSettings
 
-    return SpacecraftReproduceSettings(jobs=jobs, worlds=episodes or 20, backend=backend)
+    return SpacecraftReproduceSettings(**asked | ({} if episodes is None else {"worlds": episodes}))
 
 
 def _reproduced(task: str, folder: Path) -> Outputs:

@@ -217,7 +217,7 @@ def _create(
             algorithm_name=_ALGORITHMS[settings.task],
             author=package["Author"],
             description=_description(settings),
-            # Arrow needs pyarrow, which the benchmark has already; HDF5 would need h5py.
+            # With pyarrow, of the extra `data`; Minari's other format, HDF5, would need h5py.
             data_format="arrow",
             requirements=[f"lagros=={package['Version']}"],
         )

@@ -63,7 +63,7 @@ def export(
         typer.Option(help="Of the spacecraft: slots of the observation in ONNX; as the preset."),
     ] = None,
 ) -> None:
-    """Write u_L(x, o_l, t) as a file without Python, from an observation to newtons."""
+    """Write a policy's network as one C file or ONNX model: observation in, newtons out."""
     from lagros_envs.files import write_atomic
     from lagros_policies.export.c99 import TANHS
     from lagros_policies.export.source import CARTPOLE_NAMES, SPACECRAFT_NAMES, load_source

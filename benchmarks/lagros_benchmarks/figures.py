@@ -17,6 +17,7 @@ from lagros_benchmarks.canvas import (
     caption,
     check_figure_path,
     curve,
+    log_ordinate,
     save,
     styles,
 )
@@ -77,7 +78,6 @@ def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
     floor = 0.0
     if logarithmic:
         floor = 0.5 * min(float(np.nanmin(mean[len(mean) // 8 :])) for mean in means.values())
-        axes.set_yscale("log", nonpositive="mask")  # both tubes begin at zero
     ceiling = max(1.15 * float(tube[-1]), (2.0 if logarithmic else 1.1) * top)
     labels: list[tuple[float, str, str]] = []
     for name, style in styles([row["policy"] for row in drawn]).items():
@@ -89,8 +89,12 @@ def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
         labels.append((float(last), policy_label(name, LONGEST_LABEL), style.colour))
     axes.plot(times, tube, color=BLACK, linewidth=1.5)
     labels.append((float(tube[-1]), "paper tube r(t)", BLACK))
-    note = _draw_certified(axes, rows[0], times, ceiling, labels)
+    # An agent that corrects LAG-ROS has none.
+    certified = [row for row in drawn if row["certified_tube"] is not None]
+    note = _draw_certified(axes, certified[0], times, ceiling, labels) if certified else ""
     axes.set(xlim=(times[0], times[-1]), ylim=(max(floor, 1e-3) if logarithmic else 0.0, ceiling))
+    if logarithmic:
+        log_ordinate(axes)  # without the zero at which both tubes begin
     axes.set(xlabel="time t [s]", ylabel="tracking error $\\|x - x_d\\|$  [m, rad, m/s, rad/s]")
     episodes = rows[0]["episodes"]
     axes.set_title(f"{condition_title(rows[0])}, {episodes} episodes", loc="left", fontsize=10)
@@ -172,8 +176,6 @@ def _draw_certified(
     labels: list[tuple[float, str, str]],
 ) -> str:
     """Draw the certified tube if it fits, else return a note of its size."""
-    if row["certified_tube"] is None:
-        return ""
     tube = curve(row["certified_tube"])
     if tube[-1] > ceiling:
         return f"\nnot shown: our certified tube, which grows to {tube[-1]:.3g}"

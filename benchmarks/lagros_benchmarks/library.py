@@ -21,6 +21,19 @@ Environment = gym.Env[Any, Any]
 class SetupError(Exception):
     """A run cannot begin: a policy, the planner or the metric cannot be built."""
 
+    @classmethod
+    def building(cls, what: str, error: Exception) -> SetupError:
+        """Return the error of something that cannot be built; its name is said once.
+
+        Args:
+            what: What was built, "policy 'mine:Lean'" for instance.
+            error: What that has raised.
+        """
+        text = str(error) if isinstance(error, ValueError) else ""
+        if not text.startswith(what):
+            text = f"{what} cannot be built: {type(error).__name__}: {error}"
+        return cls(text.replace("\n", " "))
+
 
 class Policy(Protocol):
     """What an episode needs of a policy: `predict` of stable-baselines3's protocol.
@@ -87,6 +100,24 @@ def make_policy(name: str, env: Any, settings: Mapping[str, Any]) -> Policy:
 
     policy: Policy = lagros_policies.make(name, env, **settings)
     return policy
+
+
+def make_single_policy(name: str, env: Any) -> Policy:
+    """Build the policy of a command that flies one.
+
+    Raises:
+        SetupError: It is a class of the user's own, and its constructor raises.
+        ValueError: The name is unknown, or the file is not valid.
+        OSError: A file cannot be read.
+        ImportError: An extra that the policy needs is not installed.
+    """
+    try:
+        return make_policy(name, env, {})
+    except (ValueError, OSError, ImportError):
+        raise
+    except Exception as error:
+        text = f"policy {name!r} cannot be built: {type(error).__name__}: {error}"
+        raise SetupError(text) from error
 
 
 def make_filter(policy: Any, env: Any, disturbance_bound: float) -> Policy:

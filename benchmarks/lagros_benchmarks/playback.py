@@ -13,11 +13,11 @@ import gymnasium as gym
 import numpy as np
 
 import lagros_envs  # noqa: F401  (registers the environments)
-import lagros_policies
 from lagros_benchmarks import library
 from lagros_benchmarks.settings import unknown_name
 from lagros_benchmarks.video import FRAME_RATES, Frame, check_video_path, write_video
 from lagros_envs import spacecraft_v0
+from lagros_envs.checks import check_at_least, check_not_negative, check_positive, check_seed
 from lagros_envs.disturbances import KINDS
 from lagros_envs.scenarios import PRESETS, Preset, Scenario, preset_named
 from lagros_envs.seeding import episode_streams
@@ -74,16 +74,14 @@ class WatchSettings:
             raise ValueError(unknown_name("disturbance", self.disturbance, WATCHED_KINDS))
         if self.preset is not None and self.preset not in PRESETS:
             raise ValueError(unknown_name("preset", self.preset, PRESETS))
-        if self.agents is not None and self.agents < 1:
-            raise ValueError(f"agents={self.agents!r} must be at least 1")
-        if self.seed < 0:
-            raise ValueError(f"seed={self.seed!r} must be a non-negative integer")
-        if self.bound is not None and not (math.isfinite(self.bound) and self.bound >= 0.0):
-            raise ValueError(f"bound={self.bound!r} must be finite and >= 0")
-        for name in ("speed", "seconds"):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name}={value!r} must be finite and > 0")
+        if self.agents is not None:
+            check_at_least("agents", self.agents, 1)
+        check_seed(self.seed)
+        if self.bound is not None:
+            check_not_negative("bound", self.bound)
+        check_positive("speed", self.speed)
+        if self.seconds is not None:
+            check_positive("seconds", self.seconds)
         if self.task == "cartpole":
             for name in ("agents", "preset", "scenario", "safety_filter"):
                 if getattr(self, name):
@@ -108,6 +106,7 @@ class Playback:
         ValueError: The policy's name is unknown, or the scenario is not valid or does not fit.
         OSError: The scenario cannot be read, or the policy has no weights.
         ImportError: An extra that the policy needs is not installed.
+        SetupError: The constructor of a class of the user's own raises.
     """
 
     def __init__(self, settings: WatchSettings) -> None:
@@ -216,7 +215,7 @@ class _CartPoleGame:
             render_mode=render_mode,
             disable_env_checker=True,
         ).unwrapped
-        self._policy: Any = lagros_policies.make(settings.policy, self.env)
+        self._policy: Any = library.make_single_policy(settings.policy, self.env)
         self._state: Any = None
         self._info: dict[str, Any] = {}
         self._observation: Any = None
@@ -264,7 +263,7 @@ class _SpacecraftGame:
             disturbance_bound=bound,
             render_mode=render_mode,
         )
-        self._planner: Any = lagros_policies.make(settings.policy, self.env)
+        self._planner: Any = library.make_single_policy(settings.policy, self.env)
         self._policy: Any = self._planner
         if settings.safety_filter:
             self._policy = library.make_filter(self._planner, self.env, bound)

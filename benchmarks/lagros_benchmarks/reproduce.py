@@ -46,6 +46,9 @@ class ReproduceSettings:
         seed: Seed of the table.
         jobs: Processes; they change no result.
         backend: Whose processes they are; those of a cluster must see the run's folder.
+
+    Raises:
+        ValueError: A setting of the table is not valid.
     """
 
     metric: MetricDesignSettings = field(default_factory=MetricDesignSettings)
@@ -59,6 +62,10 @@ class ReproduceSettings:
     backend: Backend = LOKY
 
     free: ClassVar[tuple[str, ...]] = ("jobs", "backend", "episodes", "seed", "bound")
+
+    def __post_init__(self) -> None:
+        """Check, before hours of work, what the benchmark at their end will ask."""
+        self.benchmark(None)
 
     def make(self, folder: Path, progress: Progress, say: Say) -> None:
         """Make metric, data and networks; see `reproduction.reproduce`."""

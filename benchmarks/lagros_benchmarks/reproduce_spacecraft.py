@@ -72,6 +72,9 @@ class SpacecraftReproduceSettings:
         seed: Seed of the table.
         jobs: Processes; they change no result.
         backend: Whose processes they are; those of a cluster must see the run's folder.
+
+    Raises:
+        ValueError: A setting of the table is not valid.
     """
 
     flights: FlightSettings = field(
@@ -94,6 +97,10 @@ class SpacecraftReproduceSettings:
     jobs: int = 2
     backend: Backend = LOKY
     free: ClassVar[tuple[str, ...]] = ("jobs", "backend", "worlds", "seed", "bounds")
+
+    def __post_init__(self) -> None:
+        """Check, before hours of work, what the benchmark at their end will ask."""
+        self.benchmark(None)
 
     def make(self, folder: Path, progress: Progress, say: Say) -> None:
         """Make expert flights and networks; see `reproduction.reproduce`."""
@@ -200,8 +207,7 @@ class _Stage:
 
     def _samples(self, data: FlightData) -> SetSamples:
         preset = preset_named(self.settings.flights.preset)
-        core = preset.agent_radius if preset.core_radius is None else preset.core_radius
-        return flight_samples(data, self.task, preset.agent_radius, core)
+        return flight_samples(data, self.task, preset.agent_radius, preset.core)
 
 
 def _weights(folder: Path, name: str) -> Path:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import difflib
 import importlib.util
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from lagros_envs.checks import check_at_least, check_not_negative, check_seed
 from lagros_envs.disturbances import KINDS
 from lagros_envs.seeding import EVALUATION, episode_seeds
 from lagros_policies.backends import LOKY, Backend
@@ -177,15 +177,12 @@ class BenchmarkSettings:
             if kind not in KINDS:
                 raise ValueError(unknown_name("disturbance", kind, KINDS))
         for bound in self.bounds:
-            if not (math.isfinite(bound) and bound >= 0.0):
-                raise ValueError(f"bound={bound!r} must be finite and >= 0")
+            check_not_negative("bound", bound)
         if self.channels not in CHANNELS:
             raise ValueError(unknown_name("channels", self.channels, CHANNELS))
         for name in ("episodes", "jobs", "chunk", "timing_episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}={getattr(self, name)!r} must be at least 1")
-        if self.seed < 0:
-            raise ValueError(f"seed={self.seed!r} must be a non-negative integer")
+            check_at_least(name, getattr(self, name), 1)
+        check_seed(self.seed)
         if self.task == "cartpole":
             self._check_alone()
         else:
@@ -210,8 +207,7 @@ class BenchmarkSettings:
         if self.safety_filter not in SAFETY_FILTERS:
             raise ValueError(unknown_name("safety filter", self.safety_filter, SAFETY_FILTERS))
         for count in self.agents:
-            if count < 1:
-                raise ValueError(f"agents={count!r} must be at least 1")
+            check_at_least("agents", count, 1)
         if "worst" in self.disturbances:
             raise ValueError(
                 "disturbance 'worst' pushes away from one nominal trajectory that all policies "

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lagros_benchmarks.episodes import added_up, describe_error
+from lagros_benchmarks.episodes import added_up
 from lagros_benchmarks.experiment import BenchmarkRun
 from lagros_benchmarks.library import FloatArray, Policy, SetupError, Toolbox
 from lagros_benchmarks.settings import BenchmarkSettings, Case
@@ -105,7 +105,7 @@ class SpacecraftExperiment:
                 building += " with the safety filter" if case.safety_filter else ""
                 experiment.policy(case, env)
         except Exception as error:
-            raise SetupError(f"{building} cannot be built: {describe_error(error)}") from error
+            raise SetupError.building(building, error) from error
         return cls(settings, toolbox, period)
 
     @property

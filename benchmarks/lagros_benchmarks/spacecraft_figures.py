@@ -16,6 +16,7 @@ from lagros_benchmarks.canvas import (
     caption,
     check_figure_path,
     curve,
+    log_ordinate,
     save,
     styles,
 )
@@ -83,7 +84,7 @@ def _bound_figure(rows: Sequence[Row], path: Path) -> Path:
     efforts = [row["effort_mean"] for row in rows if row["effort_mean"]]
     effort = panels[len(columns)]
     if efforts and max(efforts) > _WIDE_RANGE * min(efforts):
-        effort.set_yscale("log")
+        log_ordinate(effort)
     else:
         effort.set_ylim(bottom=0.0)
     effort.set_ylabel(_EFFORT.label)
@@ -121,10 +122,11 @@ def _scale_figure(rows: Sequence[Row], path: Path) -> Path:
                     markersize=4,
                     markerfacecolor="white",
                 )
-        time.set(xscale="log", yscale="log", xlabel="agents in the world")
+        time.set(xscale="log", xlabel="agents in the world")
         time.set_xticks(counts, [str(count) for count in counts])
         time.minorticks_off()
     _finish_success(panels[0])
+    log_ordinate(panels[len(columns)])
     panels[len(columns)].set_ylabel("time [ms], median")
     first = rows[0]
     caption(

@@ -5,6 +5,8 @@ Only the standard library, typer and `extras` are imported here.
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
@@ -28,6 +30,11 @@ def fail(error: Exception | str, status: int = USAGE_ERROR) -> NoReturn:
         text += install_hint(error)
     typer.echo(f"lagros: {text}", err=True)
     raise typer.Exit(status)
+
+
+def find_users_modules() -> None:
+    """Let a policy of the user's own, module:Class, lie in the folder that lagros is run from."""
+    sys.path.insert(0, os.getcwd())
 
 
 def listed(text: str, convert: Callable[[str], Value], option: str) -> tuple[Value, ...]:

@@ -132,10 +132,12 @@ def _train_one(
             "lagros train needs stable-baselines3: pip install 'lagros[rl,policies]'"
         ) from error
     import torch
+    from rich.console import Console
 
     from lagros_benchmarks.training.lessons import lesson_of
     from lagros_benchmarks.training.run import Place
     from lagros_benchmarks.training.run import train as train_run
+    from lagros_benchmarks.training.table import final_table
 
     # One thread: networks this small gain nothing from more, and the sums stay reproducible.
     torch.set_num_threads(1)
@@ -144,9 +146,8 @@ def _train_one(
     command += "" if segments is None else f" --segments {segments}"
     command += "" if residual is None else f" --residual {residual:g}"
     record = train_run(run, place, lambda: lesson_of(run, parallel_env), command)
-    typer.echo(f"{place.weights}")
-    for row in record["final"]:
-        typer.echo("  " + "  ".join(f"{name} {value}" for name, value in row.items()))
+    typer.echo(f"{place.weights}, on held-out episodes:")
+    Console(highlight=False).print(final_table(record))
     return record
 
 

@@ -5,14 +5,12 @@ Only the standard library, typer and `terminal` are imported here; the command i
 
 from __future__ import annotations
 
-import os
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from lagros_benchmarks.terminal import fail
+from lagros_benchmarks.terminal import fail, find_users_modules
 
 
 def watch(
@@ -66,10 +64,10 @@ def watch(
     ] = None,
 ) -> None:
     """Watch one episode: agents, thrusters, sensing, tubes, goals, collisions."""
+    from lagros_benchmarks.library import SetupError
     from lagros_benchmarks.playback import Playback, WatchSettings
 
-    # A policy of the user's own, module:Class, lies in the folder that lagros is run from.
-    sys.path.insert(0, os.getcwd())
+    find_users_modules()
     try:
         settings = WatchSettings(
             task=task,
@@ -88,7 +86,7 @@ def watch(
         playback = Playback(settings)
     except (ValueError, OSError) as error:
         fail(error)
-    except ImportError as error:
+    except (ImportError, SetupError) as error:
         fail(error, status=1)
     try:
         written = playback.play()
@@ -105,4 +103,4 @@ def watch(
         typer.echo(line)
     if written is not None:
         size = written.stat().st_size / 1e6
-        typer.echo(f"wrote {written} ({playback.frames} frames, {size:.1f} MB)")
+        typer.echo(f"wrote {written} ({playback.frames} frames, {size:.2g} MB)")

@@ -50,6 +50,43 @@ def test_attack_writes_its_figures_and_flies_them_again(tmp_path: Path) -> None:
     assert "above the bound 0.3" in outside.output
 
 
+POLICIES = """
+import numpy as np
+
+
+class Unbuilt:
+    pass
+
+
+class Single:
+    def __init__(self, settings):
+        pass
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.float32([observation[..., 1]]), state
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "message"),
+    [
+        ("Unbuilt", 1, "policy 'mine_only:Unbuilt' cannot be built: TypeError: "),
+        ("Single", 2, "a search flies many episodes at a time and needs ("),
+    ],
+)
+def test_a_class_that_cannot_be_searched_is_explained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, status: int, message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "mine_only.py").write_text(POLICIES)
+    options = ["--policy", f"mine_only:{name}", "--episodes", "2", "--budget", "10"]
+    done = RUNNER.invoke(app, ["attack", "cartpole", *options])
+    assert done.exit_code == status, done.output
+    assert message in done.output
+    assert isinstance(done.exception, SystemExit)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -58,6 +58,21 @@ def test_a_mistake_is_explained_with_status_2_and_no_traceback(invoke, arguments
     assert isinstance(result.exception, SystemExit)
 
 
+@pytest.mark.parametrize("task", ["cartpole", "spacecraft"])
+@pytest.mark.parametrize(
+    "options", [("--episodes", "0"), ("--episodes", "-3", "--shipped-weights")]
+)
+def test_a_table_without_episodes_is_refused_before_anything_is_made(
+    invoke, tmp_path, monkeypatch, task, options
+):
+    for name in ("reproduction.reproduce", "cli.run_and_report"):
+        monkeypatch.setattr(f"lagros_benchmarks.{name}", lambda *_: pytest.fail("it began"))
+    result = invoke("reproduce", task, *options, "--jobs", "1")
+    assert result.exit_code == 2
+    assert f"episodes={options[1]} must be at least 1" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
 def test_bench_prints_the_table_and_writes_the_files(invoke, faked, tmp_path):
     names = ("a.json", "a.csv", "a.tex", "a.png", "a.jsonl")
     options = ("--json", "--csv", "--latex", "--figure", "--episodes-file")

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from lagros_benchmarks import figures, files, formats, tables
+from lagros_benchmarks import canvas, figures, files, formats, tables
 from lagros_benchmarks.records import summarise
 from lagros_benchmarks.runner import run_benchmark
 from lagros_benchmarks.settings import BenchmarkSettings
+from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
 from tests.benchmarks import fakes
 
 POLICIES = ("steady", "idle", "raising")
@@ -213,10 +214,36 @@ def test_a_figure_says_what_it_cannot_draw(rows, grid_rows, tmp_path):
 
 
 def test_known_policies_always_look_the_same_and_all_differ():
-    names = ["lagros", "x.zip", "tube-mpc", "y.zip", "learned", "lqr", "ppo", "random"]
+    known = dict.fromkeys((*NAMES, *SPACECRAFT_NAMES))
+    names = ["x.zip", *known, "y.zip", "mine:A", "mine:B", "mine:C"]
     found = figures.styles(names)
-    assert found["lagros"] == figures.styles(["lagros"])["lagros"]
-    assert len({(style.colour, str(style.line)) for style in found.values()}) == len(names)
+    for name in known:
+        assert figures.styles(["z.zip", name])[name] == found[name]
+    for part in ("colour", "line", "marker"):
+        # Only (d) and LQR, which no task has both of, share a mark.
+        same = len(names) - len({str(getattr(style, part)) for style in found.values()})
+        assert same == (part == "marker")
+    assert canvas.BLACK not in {style.colour for style in found.values()}  # that of the tubes
+
+
+@pytest.mark.parametrize(
+    ("ends", "labels"),
+    [
+        ((0.16, 7.0), ["0.2", "0.5", "1", "2", "5"]),
+        ((0.3, 22.0), ["0.5", "1", "2", "5", "10", "20"]),
+        ((0.005, 90.0), ["0.01", "0.1", "1", "10"]),
+    ],
+)
+def test_a_logarithmic_ordinate_has_few_and_plain_labels(ends, labels):
+    figure, (axes,) = canvas.canvas(4.0, 3.0)
+    axes.plot([0.0, 1.0], ends)
+    axes.set_ylim(*ends)
+    canvas.log_ordinate(axes)
+    figure.draw_without_rendering()
+    low, high = axes.get_ylim()
+    marks = [*axes.yaxis.get_major_ticks(), *axes.yaxis.get_minor_ticks()]
+    shown = [mark.label1.get_text() for mark in marks if low <= mark.get_loc() <= high]
+    assert [text for text in shown if text] == labels
 
 
 def test_markdown_is_one_table_with_the_paired_differences(rows):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from lagros_benchmarks.runner import Case, run_benchmark
 from lagros_benchmarks.settings import BenchmarkSettings
 from tests.benchmarks import fakes
 
-# design.md, "Public figures of a run".
+# What a row of results is made of; a name that goes breaks who reads the JSON.
 PUBLIC_KEYS = (
     *("task", "policy", "disturbance", "bound", "episodes", "safety_filter"),
     *("success_rate", "success_ci95", "strict_success_rate", "collision_rate"),
@@ -153,6 +154,34 @@ def test_no_plan_at_all_leaves_the_curves_empty():
     assert row["mean_tracking_error"] is None
     assert row["tracking_error_mean_below_tube"] is False
     assert row["success_rate"] > 0.0
+
+
+def test_the_tube_of_u_star_is_not_given_to_a_policy_that_adds_a_correction():
+    """Its row and its episodes say nothing of that tube; those of the others do not change."""
+
+    class Corrected(fakes.LinearPolicy):
+        largest_correction = 4.0
+
+    def make_policy(name, env, settings):
+        return Corrected(name) if name == "corrected" else fakes.make_policy(name, env, settings)
+
+    toolbox = replace(fakes.EASY, make_policy=make_policy)
+    settings = BenchmarkSettings(policies=("steady", "corrected"), episodes=3)
+    run = run_benchmark(settings, toolbox)
+    steady, corrected = summarise(run)
+    assert steady["certified_tube"] is not None
+    assert steady["certified_violation_rate"] is not None
+    assert corrected["certified_tube"] is None
+    assert corrected["certified_violation_rate"] is None
+    assert corrected["tube_violation_rate"] == steady["tube_violation_rate"]
+    assert all(r.left_certified_tube is None for r in records_of(run, "corrected"))
+
+
+def test_the_shipped_correction_is_known_to_be_one():
+    """The name by which the benchmark sees a correction is that of the policy itself."""
+    from lagros_policies.residual import ResidualPolicy
+
+    assert ResidualPolicy().largest_correction > 0.0
 
 
 def test_a_parallel_run_keeps_both_step_times():

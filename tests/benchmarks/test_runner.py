@@ -143,3 +143,10 @@ def test_progress_is_told_of_every_chunk():
     told = []
     plan_nominals(settings_of("steady"), fakes.EASY, lambda *args: told.append(args))
     assert told == [("planning", 1, 3), ("planning", 2, 3), ("planning", 3, 3)]
+
+
+def test_what_cannot_be_built_is_named_once():
+    known = SetupError.building("policy 'a'", ValueError("policy 'a': no such\nclass"))
+    assert str(known) == "policy 'a': no such class"
+    other = SetupError.building("policy 'a'", TypeError("policy 'a': 3 arguments"))
+    assert str(other) == "policy 'a' cannot be built: TypeError: policy 'a': 3 arguments"

@@ -19,7 +19,7 @@ from lagros_benchmarks.spacecraft_experiment import SpacecraftRun
 from lagros_benchmarks.spacecraft_timing import Timing
 from tests.benchmarks import spacecraft_fakes as fakes
 
-# design.md, "Public figures of a run".
+# What a row of results is made of; a name that goes breaks who reads the JSON.
 PUBLIC_KEYS = (
     *("task", "policy", "disturbance", "bound", "episodes", "safety_filter", "agents", "preset"),
     *("success_rate", "success_ci95", "success_world_ci95", "strict_success_rate"),

@@ -61,6 +61,11 @@ class Broken(Pilot):
         return super().predict(observation, state, episode_start, deterministic)
 
 
+class Unbuilt(Pilot):
+    def __init__(self):
+        """Takes no settings."""
+
+
 class Plan:
     def __init__(self, nominal):
         self.nominal = nominal
@@ -342,6 +347,13 @@ def test_a_mistake_is_explained_with_status_2(invoke, arguments, message):
     result = invoke(*given)
     assert result.exit_code == 2
     assert message in result.output
+    assert isinstance(result.exception, SystemExit)
+
+
+def test_a_class_that_cannot_be_built_is_explained(invoke):
+    result = invoke("spacecraft", "--policy", "pilots:Unbuilt", "--video", "x.gif")
+    assert result.exit_code == 1
+    assert "policy 'pilots:Unbuilt' cannot be built: TypeError: " in result.output
     assert isinstance(result.exception, SystemExit)
 
 

@@ -41,8 +41,6 @@ _ABSCISSAE = {
     "cartpole": "control steps [millions]",
     "spacecraft": "control steps of all agents [millions]",
 }
-# Those that are rows of `lagros bench`, in the order in which its figure tells them apart.
-_AGENTS = ("ppo", "sac", "td3")
 # What a point of a curve has besides its figures.
 AXES = ("steps", "seconds", "cpu_seconds")
 
@@ -172,7 +170,11 @@ def draw(curves: dict[str, Any], path: str | Path) -> Path:
 
 def _looks(labels: Sequence[str]) -> dict[str, Style]:
     """Return a style for each label; an agent looks as it does in the figures of `lagros bench`."""
-    return styles([*_AGENTS, *(label for label in labels if label not in _AGENTS)])
+    # The policy `residual` is one of the corrections; a second one is told apart from it.
+    first = next((label for label in labels if label.startswith("residual")), None)
+    policies = {label: "residual" if label == first else label for label in labels}
+    found = styles(list(policies.values()))
+    return {label: found[policy] for label, policy in policies.items()}
 
 
 def _caption(curves: dict[str, Any]) -> str:

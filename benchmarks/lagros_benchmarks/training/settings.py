@@ -7,11 +7,11 @@ beside its weights.
 from __future__ import annotations
 
 import difflib
-import math
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, ClassVar
 
 from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.checks import check_positive, check_whole
 from lagros_envs.seeding import EVALUATION
 
 # Segments are namespaces of their own in `lagros_envs.seeding`'s sense, far below `EVALUATION`.
@@ -33,16 +33,9 @@ class _Ranged:
     def __post_init__(self) -> None:
         """Check the ranges."""
         for name in self.positive:
-            _check_positive(name, getattr(self, name))
+            check_positive(name, getattr(self, name))
         for name in self.counts:
-            value = getattr(self, name)
-            if value != int(value) or value < 1:
-                raise ValueError(f"{name}={value!r} must be a whole number >= 1")
-
-
-def _check_positive(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0.0):
-        raise ValueError(f"{name}={value!r} must be finite and > 0")
+            check_whole(name, getattr(self, name))
 
 
 @dataclass(frozen=True)
@@ -241,7 +234,7 @@ class CartPoleTraining(Training):
         """Check the values."""
         super().__post_init__()
         if self.largest_correction is not None:
-            _check_positive("largest_correction", self.largest_correction)
+            check_positive("largest_correction", self.largest_correction)
             most = CartPoleSettings().force_scale
             if self.largest_correction > most:
                 raise ValueError(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401  (registers the environments)
-from lagros_benchmarks.library import make_filter, make_policy, position_margin
+from lagros_benchmarks.library import make_filter, make_single_policy, position_margin
 from lagros_benchmarks.metrics import wilson_interval
 from lagros_benchmarks.settings import check_policy, check_task
 from lagros_benchmarks.spacecraft_episodes import bare
@@ -46,6 +46,7 @@ from lagros_benchmarks.worst_case.spacecraft import (
     first_adversaries,
 )
 from lagros_envs import spacecraft_task
+from lagros_envs.checks import check_at_least, check_positive, check_seed
 from lagros_envs.disturbances import Disturbance
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
@@ -103,13 +104,10 @@ class AttackSettings:
         check_policy(self.policy, self.task)
         if self.goal not in GOALS:
             raise ValueError(f"goal={self.goal!r} must be one of {', '.join(GOALS)}")
-        if not (math.isfinite(self.bound) and self.bound > 0.0):
-            raise ValueError(f"bound={self.bound!r} must be finite and > 0")
+        check_positive("bound", self.bound)
         for name in ("episodes", "agents"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}={getattr(self, name)!r} must be at least 1")
-        if self.seed < 0:
-            raise ValueError(f"seed={self.seed!r} must be a non-negative integer")
+            check_at_least(name, getattr(self, name), 1)
+        check_seed(self.seed)
         if self.safety_filter and self.task == "cartpole":
             raise ValueError("safety_filter=True is for the task spacecraft; leave it out")
         if self.policy == "random":
@@ -206,7 +204,7 @@ class _CartPoleBench:
         """Build everything, and plan the episodes."""
         self.settings = settings
         env: Any = gym.make("lagros/CartPole-v0", disable_env_checker=True)
-        self.policy = cast(Any, make_policy(settings.policy, env, {}))
+        self.policy = cast(Any, make_single_policy(settings.policy, env))
         self.tracks = type(self.policy) in _TRACKERS
         # One whose metric is a network is held against the tube of its own.
         self.expert: CartPoleExpert = self.policy.expert if self.tracks else CartPoleExpert()
@@ -266,7 +264,7 @@ def _targets(settings: AttackSettings) -> list[SpacecraftTarget]:
     env = SpacecraftVectorEnv(
         settings.agents, settings.agents, settings.preset, "none", settings.bound
     )
-    policy = make_policy(settings.policy, env, {})
+    policy = make_single_policy(settings.policy, env)
     margin = position_margin(policy, settings.bound)
     if settings.safety_filter:
         # What the filter changes is not u*.

@@ -127,7 +127,8 @@ def policy_law(policy: Any, episodes: Episodes) -> Law:
     """Return a policy that keeps no memory as a law.
 
     Raises:
-        ValueError: The policy remembers something between its calls.
+        ValueError: The policy remembers something between its calls, or answers a batch by
+            anything but one action for each row.
     """
     settings = episodes.settings
 
@@ -142,6 +143,12 @@ def policy_law(policy: Any, episodes: Episodes) -> Law:
             raise ValueError(
                 f"policy {getattr(policy, 'name', policy)!r} keeps a memory; a search needs one "
                 "that does not, or tube-mpc"
+            )
+        if np.shape(action) != (len(rows), 1):
+            raise ValueError(
+                f"policy {getattr(policy, 'name', policy)!r} answers {len(rows)} observations, "
+                f"shape {rows.shape}, by actions of shape {np.shape(action)}; a search flies many "
+                f"episodes at a time and needs {(len(rows), 1)}"
             )
         return _applied(settings, action)
 

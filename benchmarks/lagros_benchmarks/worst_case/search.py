@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lagros_benchmarks.worst_case.optimisers import OPTIMISERS, make_search
 from lagros_benchmarks.worst_case.sequences import PARAMETRISATIONS, Parametrisation
+from lagros_envs.checks import check_at_least
 from lagros_envs.disturbances import into_unit_ball, onto_unit_sphere
 
 FloatArray = NDArray[np.float64]
@@ -96,8 +97,7 @@ class SearchSettings:
                     f"{name}={getattr(self, name)!r} must be one of {', '.join(valid)}"
                 )
         for name, least in (("pieces", 1), ("budget", 1), ("population", 2), ("restarts", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}={getattr(self, name)!r} must be at least {least}")
+            check_at_least(name, getattr(self, name), least)
 
 
 @dataclass(frozen=True)
