@@ -15,7 +15,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_multiple, check_not_negative, check_positive
 from lagros_envs.dynamics import CartPole
+from lagros_envs.options import nominal_option
 from lagros_envs.tube import PaperTube
 
 FloatArray = NDArray[np.float64]
@@ -74,21 +76,15 @@ class CartPoleSettings:
         """Check the values."""
         for item in fields(self):
             value = getattr(self, item.name)
-            if isinstance(value, int | float) and not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{item.name}={value!r} must be finite and >= 0")
+            if isinstance(value, int | float):
+                check_not_negative(item.name, value)
         for name in ("control_period", "time_limit", "force_scale"):
-            if getattr(self, name) == 0.0:
-                raise ValueError(f"{name}=0.0 must be > 0")
-        if self.force_limit == 0.0:
-            raise ValueError("force_limit=0.0 must be > 0, or None for no limit")
+            check_positive(name, getattr(self, name))
+        if self.force_limit is not None:
+            check_positive("force_limit", self.force_limit, "or None for no limit")
         if self.initial_angle >= FALL_ANGLE:
             raise ValueError(f"initial_angle={self.initial_angle!r} must be below pi/2")
-        periods = self.time_limit / self.control_period
-        if abs(periods - round(periods)) > 1e-9:
-            raise ValueError(
-                f"time_limit={self.time_limit!r} must be a whole number of "
-                f"control_period={self.control_period!r}"
-            )
+        check_multiple("time_limit", self.time_limit, "control_period", self.control_period)
 
     @property
     def steps(self) -> int:
@@ -186,19 +182,8 @@ def nominal_from_options(
     Raises:
         ValueError: The trajectory has the wrong shape or is not finite.
     """
-    value = options.get("nominal")
-    if value is None:
-        return None
-    nominal = np.array(value, dtype=np.float64)
-    wanted = (*batch, settings.steps + 1, STATE_DIM)
-    if nominal.shape != wanted or not np.all(
-        np.isfinite(nominal[... if looked_at is None else looked_at])
-    ):
-        raise ValueError(
-            f"options['nominal'] has shape {nominal.shape}; it must be finite and of shape "
-            f"{wanted}, the nominal state at every control instant"
-        )
-    return nominal
+    shape = (*batch, settings.steps + 1, STATE_DIM)
+    return nominal_option(options, shape, "the nominal state", looked_at)
 
 
 def named_space(settings: CartPoleSettings) -> spaces.Dict:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
 from lagros_envs.autoreset import RestartingVectorEnv, nominal_after
+from lagros_envs.checks import check_at_least
 from lagros_envs.disturbances import Disturbance, Situation, channel_mask
 from lagros_envs.dynamics.held import HeldBatch
 from lagros_envs.seeding import seeded_streams
@@ -63,8 +64,7 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         render_mode: str | None = None,
     ) -> None:
         """Build the worlds; see the class for the arguments."""
-        if num_envs < 1:
-            raise ValueError(f"num_envs={num_envs!r} must be at least 1")
+        check_at_least("num_envs", num_envs, 1)
         self.settings = settings or task.CartPoleSettings()
         self.named_space = task.named_space(self.settings)
         super().__init__(

@@ -10,10 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, cast
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lagros_envs.checks import check_not_negative
 
 FloatArray = NDArray[np.float64]
 
@@ -232,8 +235,7 @@ class Disturbance:
                 f"disturbance={self.kind!r} is not known; use one of {', '.join(KINDS)} "
                 "or a callable"
             )
-        if not (math.isfinite(self.bound) and self.bound >= 0.0):
-            raise ValueError(f"disturbance_bound={self.bound!r} must be finite and >= 0")
+        check_not_negative("disturbance_bound", self.bound)
         if not any(self.channels):
             raise ValueError("channels must leave at least one state disturbed")
         if self.kind == "worst" and self.metric is None:
@@ -242,10 +244,19 @@ class Disturbance:
                 "a function of the state"
             )
 
+    @cached_property
+    def feedback(self) -> Feedback | None:
+        """The function whose projected value is d; None for an open-loop kind."""
+        if not isinstance(self.kind, str):
+            return self.kind
+        if self.kind == "worst" and self.metric is not None:
+            return WorstCase(self.metric)
+        return None
+
     @property
     def is_feedback(self) -> bool:
         """Whether d depends on the state."""
-        return self.kind == "worst" or not isinstance(self.kind, str)
+        return self.feedback is not None
 
     def realise(self, rng: np.random.Generator, steps: int, period: float) -> FloatArray:
         """Draw the disturbance of one episode.
@@ -274,7 +285,8 @@ class Disturbance:
             period: Control period [s].
         """
         # A feedback kind draws no sequence; its episode only needs one direction.
-        kind = OPEN_LOOP["constant" if self.is_feedback else cast(str, self.kind)]
+        kind = OPEN_LOOP.get(self.kind) if isinstance(self.kind, str) else None
+        kind = kind or OPEN_LOOP["constant"]
         bound = 1.0 if self.is_feedback else self.bound
         episodes, steps, _ = sequences.shape
         disturbed = np.flatnonzero(self.channels)
@@ -296,10 +308,12 @@ class Disturbance:
         """Return d of a feedback kind, shape (..., n), of norm at most the bound.
 
         Raises:
-            ValueError: The callable returned a wrong shape or a value that is not finite.
+            ValueError: The kind is an open-loop one, or the callable returned a wrong shape or a
+                value that is not finite.
         """
-        feedback = WorstCase(self.metric) if self.kind == "worst" else cast(Feedback, self.kind)  # type: ignore[arg-type]
-        push = np.asarray(feedback(situation), dtype=np.float64)
+        if self.feedback is None:
+            raise ValueError(f"disturbance={self.kind!r} does not respond to states: realise it")
+        push = np.asarray(self.feedback(situation), dtype=np.float64)
         if push.shape != situation.state.shape or not np.all(np.isfinite(push)):
             raise ValueError(
                 f"the disturbance callable returned shape {push.shape} (finite: "

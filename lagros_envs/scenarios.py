@@ -11,6 +11,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_at_least, check_not_negative, check_positive
 from lagros_envs.files import write_atomic
 from lagros_envs.reachable import way_exists
 
@@ -76,10 +77,8 @@ class Scenario:
             raise ValueError("starts is empty; a scenario needs at least one agent")
         if self.core_radius is None:
             object.__setattr__(self, "core_radius", self.agent_radius)
-        if not (math.isfinite(self.agent_radius) and self.agent_radius > 0.0):
-            raise ValueError(f"agent_radius={self.agent_radius!r} must be finite and > 0")
-        if not (math.isfinite(self.core) and self.core >= 0.0):
-            raise ValueError(f"core_radius={self.core_radius!r} must be finite and >= 0, or None")
+        check_positive("agent_radius", self.agent_radius)
+        check_not_negative("core_radius", self.core, "or None for agent_radius")
         if np.any(self.obstacle_radii <= 0.0):
             raise ValueError(f"obstacle_radii={self.obstacle_radii.tolist()} must be > 0")
         self._check_starts()
@@ -184,20 +183,21 @@ class Preset:
     def __post_init__(self) -> None:
         """Check the values."""
         for name in ("arena", "obstacle_radius", "agent_radius"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name}={value!r} must be finite and > 0")
-        for name in ("core_radius", "margin", "least_way", "heading_range"):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name}={value!r} must be finite and >= 0")
+            check_positive(name, getattr(self, name))
+        check_not_negative("core_radius", self.core, "or None for agent_radius")
+        for name in ("margin", "least_way", "heading_range"):
+            check_not_negative(name, getattr(self, name))
         fewest, most = self.obstacle_count
         if not 0 <= fewest <= most:
             raise ValueError(f"obstacle_count={self.obstacle_count!r} must be 0 <= fewest <= most")
-        if self.agents < 1:
-            raise ValueError(f"agents={self.agents!r} must be at least 1")
+        check_at_least("agents", self.agents, 1)
         if self.layout not in ("random", "antipodal"):
             raise ValueError(f'layout={self.layout!r} must be "random" or "antipodal"')
+
+    @property
+    def core(self) -> float:
+        """The agents' radius against obstacles [m]."""
+        return self.agent_radius if self.core_radius is None else self.core_radius
 
     def for_agents(self, num_agents: int | None = None) -> Preset:
         """Return the preset with its sizes for this many agents.
@@ -206,8 +206,7 @@ class Preset:
             ValueError: The number is less than 1.
         """
         count = self.agents if num_agents is None else num_agents
-        if count < 1:
-            raise ValueError(f"num_agents={count!r} must be at least 1")
+        check_at_least("num_agents", count, 1)
         if not self.grows:
             return replace(self, agents=count)
         share = max(1.0, count / self.agents)
@@ -282,14 +281,14 @@ def preset_named(preset: str | Preset) -> Preset:
 
 def _attempt(preset: Preset, rng: np.random.Generator) -> Scenario | None:
     """Draw once; None if something found no place or a goal cannot be reached."""
-    core = preset.agent_radius if preset.core_radius is None else preset.core_radius
     fewest, most = preset.obstacle_count
     count = int(rng.integers(fewest, most, endpoint=True))
-    gap = 2.0 * (preset.obstacle_radius + (core + preset.margin if preset.open_passages else 0.0))
+    passage = preset.core + preset.margin if preset.open_passages else 0.0
+    gap = 2.0 * (preset.obstacle_radius + passage)
     obstacles = _scatter(rng, preset.arena, count, gap)
     if obstacles is None:
         return None
-    clearance = preset.obstacle_radius + core + preset.margin
+    clearance = preset.obstacle_radius + preset.core + preset.margin
     if preset.layout == "antipodal":
         ends = _opposite_ends(preset, rng)
         if not all(np.all(_clear(points, obstacles, clearance)) for points in ends):

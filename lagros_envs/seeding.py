@@ -13,6 +13,8 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_seed
+
 _Words = NDArray[np.uint32]
 
 # Namespace of the episodes that a policy is judged on ("eval" in ASCII). Training draws from the
@@ -74,8 +76,7 @@ def episode_streams(seed: int) -> Streams:
     Raises:
         ValueError: The seed is negative.
     """
-    if seed < 0:
-        raise ValueError(f"seed={seed!r} must be a non-negative integer")
+    check_seed(seed)
     return Streams(seed)
 
 

@@ -5,14 +5,15 @@ Every definition works on arrays of any leading shape, so that one agent and man
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_at_least, check_multiple, check_not_negative, check_positive
 from lagros_envs.dynamics.spacecraft import Spacecraft
+from lagros_envs.options import nominal_option
 from lagros_envs.tube import PaperTube
 
 FloatArray = NDArray[np.float64]
@@ -69,20 +70,14 @@ class SpacecraftSettings:
         """Check the values."""
         for item in fields(self):
             value = getattr(self, item.name)
-            if isinstance(value, int | float) and not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{item.name}={value!r} must be finite and >= 0")
+            if isinstance(value, int | float):
+                check_not_negative(item.name, value)
         for name in ("control_period", "horizon", "time_limit", "goal_radius", "thrust_scale"):
-            if getattr(self, name) == 0.0:
-                raise ValueError(f"{name}=0.0 must be > 0")
-        if self.thrust_limit == 0.0:
-            raise ValueError("thrust_limit=0.0 must be > 0, or None for no limit")
+            check_positive(name, getattr(self, name))
+        if self.thrust_limit is not None:
+            check_positive("thrust_limit", self.thrust_limit, "or None for no limit")
         for name in ("horizon", "time_limit"):
-            periods = getattr(self, name) / self.control_period
-            if abs(periods - round(periods)) > 1e-6:
-                raise ValueError(
-                    f"{name}={getattr(self, name)!r} must be a whole number of "
-                    f"control_period={self.control_period!r}"
-                )
+            check_multiple(name, getattr(self, name), "control_period", self.control_period, 1e-6)
 
     @property
     def steps(self) -> int:
@@ -98,8 +93,7 @@ def limited(settings: SpacecraftSettings, steps: int | None) -> SpacecraftSettin
     """
     if steps is None:
         return settings
-    if steps < 1:
-        raise ValueError(f"max_cycles={steps!r} must be at least 1, or None for the time limit")
+    check_at_least("max_cycles", steps, 1, "or None for the time limit")
     return replace(settings, time_limit=steps * settings.control_period)
 
 
@@ -157,20 +151,9 @@ def nominal_from_options(
     Raises:
         ValueError: The trajectory has the wrong shape or is not finite.
     """
-    value = options.get("nominal")
-    if value is None:
-        return None
-    nominal = np.array(value, dtype=np.float64)
     *leading, agents = batch
-    wanted = (*leading, settings.steps + 1, agents, STATE_DIM)
-    if nominal.shape != wanted or not np.all(
-        np.isfinite(nominal[... if looked_at is None else looked_at])
-    ):
-        raise ValueError(
-            f"options['nominal'] has shape {nominal.shape}; it must be finite and of shape "
-            f"{wanted}, the nominal state of every agent at every control instant"
-        )
-    return nominal
+    shape = (*leading, settings.steps + 1, agents, STATE_DIM)
+    return nominal_option(options, shape, "the nominal state of every agent", looked_at)
 
 
 def reward(

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from lagros_envs.checks import check_positive
+
 
 @dataclass(frozen=True, slots=True)
 class PaperTube:
@@ -30,9 +32,7 @@ class PaperTube:
     def __post_init__(self) -> None:
         """Check the values."""
         for name in ("steady_radius", "contraction_rate"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name}={value!r} must be positive and finite")
+            check_positive(name, getattr(self, name))
 
     def radius(self, time: Any) -> Any:
         """Return r(t) for a time, or an array of times, [s]."""

@@ -5,7 +5,6 @@ They run in NumPy: neither torch nor a pickle is loaded. `lagros train cartpole`
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
+from lagros_envs.checks import check_positive
 from lagros_policies.imitation.networks import Mlp, read_safetensors, write_safetensors
 
 FloatArray = NDArray[np.float64]
@@ -82,9 +82,7 @@ class Actor:
         if not np.all(self.std > 0.0):
             raise ValueError("std must be positive")
         for name in ("feature_clip", "action_clip", "force_scale"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name}={value!r} must be finite and > 0")
+            check_positive(name, getattr(self, name))
         if self.squash not in SQUASHES:
             raise ValueError(f"squash={self.squash!r} must be one of {', '.join(SQUASHES)}")
 

@@ -23,7 +23,6 @@ obstacle the agent answers for all.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -31,6 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_not_negative, check_positive
 from lagros_policies.sensed import Sensed
 
 FloatArray = NDArray[np.float64]
@@ -92,11 +92,8 @@ class BarrierSettings:
             "blocked_speed",
         )
         for item in fields(self):
-            value = getattr(self, item.name)
-            if not math.isfinite(value) or value < 0.0:
-                raise ValueError(f"{item.name}={value!r} must be finite and >= 0")
-            if value == 0.0 and item.name not in may_be_zero:
-                raise ValueError(f"{item.name}=0.0 must be > 0")
+            check = check_not_negative if item.name in may_be_zero else check_positive
+            check(item.name, getattr(self, item.name))
 
     @classmethod
     def for_bound(cls, disturbance_bound: float) -> BarrierSettings:
@@ -108,8 +105,7 @@ class BarrierSettings:
         Raises:
             ValueError: The bound is negative or not finite.
         """
-        if not 0.0 <= disturbance_bound < math.inf:
-            raise ValueError(f"disturbance_bound={disturbance_bound!r} must be finite and >= 0")
+        check_not_negative("disturbance_bound", disturbance_bound)
         pair, obstacle, blocked = (
             base + slope * disturbance_bound
             for base, slope in (_PAIR_MARGIN, _OBSTACLE_MARGIN, _BLOCKED_SPEED)

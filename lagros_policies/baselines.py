@@ -7,7 +7,6 @@ Both policies follow stable-baselines3's `PolicyPredictor` protocol. Observation
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
+from lagros_envs.checks import check_positive
 from lagros_envs.dynamics import linearise_hold
 
 FloatArray = NDArray[np.float64]
@@ -73,8 +73,7 @@ class LqrPolicy:
                 f"state_weights={state_weights!r} must be {task.STATE_DIM} finite numbers >= 0, "
                 "the first > 0"
             )
-        if not (math.isfinite(force_weight) and force_weight > 0.0):
-            raise ValueError(f"force_weight={force_weight!r} must be finite and > 0")
+        check_positive("force_weight", force_weight)
         _, transition, effect = linearise_hold(
             self.settings.system,
             np.zeros(task.STATE_DIM),

@@ -219,7 +219,7 @@ class CentralizedPolicy:
                 obstacles[:, :2],
                 obstacles[:, 2],
                 self.preset.agent_radius,
-                self.preset.core_radius,
+                self.preset.core,
                 min(planning.horizon, left),
             )
         # Without a plan: at rest where it is.

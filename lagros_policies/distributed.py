@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
+from lagros_envs.checks import check_at_least, check_not_negative
 from lagros_envs.observation import Layout
 from lagros_envs.scenarios import Preset
 from lagros_policies.contraction.double_integrator import planned_margin
@@ -129,11 +130,9 @@ class DistributedTubeMpcPolicy:
         """Build planner and law."""
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
-        if replan_every < 1:
-            raise ValueError(f"replan_every={replan_every!r} must be at least 1 control step")
+        check_at_least("replan_every", replan_every, 1)
         for name, time in (("kept_for", kept_for), ("smoothing", smoothing)):
-            if not 0.0 <= time < np.inf:
-                raise ValueError(f"{name}={time!r} must be finite and >= 0")
+            check_not_negative(name, time)
         body, period = self.settings.system, self.settings.control_period
         self.tracking = WrenchTracking.for_rates(body, period, contraction_rate, turning_rate)
         self.margin = planned_margin(margin, disturbance_bound, contraction_rate)
@@ -270,7 +269,6 @@ class DistributedTubeMpcPolicy:
     def _discs(self, known: LocalMap) -> Discs:
         obstacles, neighbours = known.obstacles, known.neighbours
         preset = self.preset
-        core = preset.agent_radius if preset.core_radius is None else preset.core_radius
         counts = len(obstacles), len(neighbours)
         speed = np.hypot(neighbours[:, 2], neighbours[:, 3])
         moving = speed > self.still
@@ -279,7 +277,9 @@ class DistributedTubeMpcPolicy:
         return Discs(
             np.vstack([obstacles[:, :2], neighbours[:, :2]]),
             velocities,
-            np.concatenate([obstacles[:, 2] + core, np.full(counts[1], 2.0 * preset.agent_radius)]),
+            np.concatenate(
+                [obstacles[:, 2] + preset.core, np.full(counts[1], 2.0 * preset.agent_radius)]
+            ),
             np.repeat([self.margin, PAIR_SHARE * self.margin], counts),
             np.concatenate([np.zeros(counts[0], bool), moving]),
         )

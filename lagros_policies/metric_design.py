@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
+from lagros_envs.checks import check_at_least
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_policies.contraction import (
@@ -54,8 +55,8 @@ class MetricDesignSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if min(self.plans, self.pool, self.checks) < 1:
-            raise ValueError("plans, pool and checks must be at least 1")
+        for name in ("plans", "pool", "checks"):
+            check_at_least(name, getattr(self, name), 1)
 
 
 def design_cartpole_metric(

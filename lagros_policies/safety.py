@@ -105,14 +105,16 @@ class SafetyFilter:
             # Two thrusters push along an axis; half of that is kept for the rest.
             most = limit / self.settings.system.mass
             chosen = replace(chosen, braking=min(chosen.braking, most))
-        radius, core = self.preset.agent_radius, self.preset.core_radius
         self._softness = np.repeat(
             [1.0, _OBSTACLE_SOFTNESS, 0.0], [self.layout.neighbours, self.layout.obstacles, 4]
         )
         thrusters = np.eye(task.THRUSTERS)
         self._wrench_of_thrust = np.stack(self.settings.system.wrench(list(thrusters)), axis=-1)
         self.barrier = BrakingBarrier(
-            chosen, radius, radius if core is None else core, self.settings.control_period
+            chosen,
+            self.preset.agent_radius,
+            self.preset.core,
+            self.settings.control_period,
         )
 
     def predict(

@@ -8,12 +8,12 @@ it answers what the sensors show: a lost margin, a velocity that no plan would h
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_positive
 from lagros_envs.scenarios import Scenario
 from lagros_envs.spacecraft_task import STATE_DIM, SpacecraftSettings
 from lagros_policies.centralized import planner_settings
@@ -58,9 +58,7 @@ class SpacecraftExpertSettings:
     def __post_init__(self) -> None:
         """Check the values."""
         for item in fields(self):
-            value = getattr(self, item.name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{item.name}={value!r} must be positive and finite")
+            check_positive(item.name, getattr(self, item.name))
 
 
 class SpacecraftExpert:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 from typing import Any
 
+from lagros_envs.checks import check_not_negative, check_positive
 from lagros_envs.dynamics.system import Components
 
 POSITION, ANGLE, VELOCITY, ANGULAR_RATE = range(4)
@@ -40,11 +40,8 @@ class CartPole:
     def __post_init__(self) -> None:
         """Check that the parameters are physical."""
         for field in fields(self):
-            value = getattr(self, field.name)
-            friction = field.name.endswith("friction")
-            if not math.isfinite(value) or value < 0 or (value == 0 and not friction):
-                needed = ">= 0" if friction else "> 0"
-                raise ValueError(f"{field.name}={value!r} must be a finite number {needed}")
+            check = check_not_negative if field.name.endswith("friction") else check_positive
+            check(field.name, getattr(self, field.name))
 
     @property
     def state_dim(self) -> int:

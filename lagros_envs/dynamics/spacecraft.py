@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 from typing import Any
 
+from lagros_envs.checks import check_positive
 from lagros_envs.dynamics.system import Components
 
 X, Y, HEADING, VELOCITY_X, VELOCITY_Y, SPIN = range(6)
@@ -37,9 +37,7 @@ class Spacecraft:
     def __post_init__(self) -> None:
         """Check that the parameters are physical."""
         for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{field.name}={value!r} must be a finite number > 0")
+            check_positive(field.name, getattr(self, field.name))
 
     @property
     def state_dim(self) -> int:

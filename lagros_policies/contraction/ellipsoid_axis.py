@@ -25,6 +25,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_positive
 from lagros_policies.contraction.double_integrator import flow
 
 FloatArray = NDArray[np.float64]
@@ -85,8 +86,7 @@ def design_axis_ellipsoid(
     """
     from scipy.optimize import minimize
 
-    if not (math.isfinite(period) and period > 0.0):
-        raise ValueError(f"period={period!r} must be positive and finite")
+    check_positive("period", period)
 
     def size(values: FloatArray) -> float:
         share = 1.0 / (1.0 + math.exp(-values[0]))

@@ -36,11 +36,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from lagros_envs.checks import check_at_least, check_not_negative, check_positive
 from lagros_envs.dynamics import System, control_matrix, jacobian
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.proof.box import ProofBox
-from lagros_policies.contraction.semidefinite import svec, symmetric_basis
+from lagros_policies.contraction.semidefinite import solve_conic, svec, symmetric_basis
 from lagros_policies.contraction.tube_design import PlanBox, self_contained
 
 FloatArray = NDArray[np.float64]
@@ -93,13 +94,9 @@ class HeldDesign:
     def __post_init__(self) -> None:
         """Check the values."""
         for name in ("period", "rate", "disturbance_bound", "control_penalty", "floor"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name}={value!r} must be positive and finite")
-        if not (math.isfinite(self.margin) and self.margin >= 0.0):
-            raise ValueError(f"margin={self.margin!r} must be finite and >= 0")
-        if self.degree < 1:
-            raise ValueError(f"degree={self.degree!r} must be at least 1")
+            check_positive(name, getattr(self, name))
+        check_not_negative("margin", self.margin)
+        check_at_least("degree", self.degree, 1)
         if self.output is not None and len(self.output) != _STATES:
             raise ValueError(f"output={self.output!r} must have {_STATES} entries")
 
@@ -366,20 +363,8 @@ def _solve(lifted: FloatArray, design: HeldDesign) -> tuple[FloatArray | None, s
     cost = np.zeros(columns)
     cost[:size] = design.control_penalty * _FORCE**2 * basis[:, -1, -1]
     cost[-1] = 1.0
-    options: Any = clarabel.DefaultSettings()
-    options.verbose = False
-    options.max_threads = 1
-    answer = clarabel.DefaultSolver(
-        sparse.csc_matrix((columns, columns)),
-        cost,
-        sparse.csc_matrix(np.vstack(blocks)),
-        np.concatenate(rights),
-        cones,
-        options,
-    ).solve()
-    status = str(answer.status)
-    # An almost solved program is accepted only because every tube is proved afterwards.
-    if status not in ("Solved", "AlmostSolved"):
+    rows = sparse.csc_matrix(np.vstack(blocks))
+    values, status = solve_conic(cost, rows, np.concatenate(rights), cones)
+    if values is None:
         return None, status
-    values = np.array(answer.x)[:-1].reshape(count, size)
-    return np.einsum("kj,jab->kab", values, basis), status
+    return np.einsum("kj,jab->kab", values[:-1].reshape(count, size), basis), status

@@ -8,6 +8,7 @@ the trace, sum_ij A_ij B_ij: off-diagonals times sqrt(2) (Boyd and Vandenberghe 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -93,18 +94,32 @@ def solve_cones(program: ConeProgram) -> tuple[FloatArray | None, str]:
     """
     import clarabel
 
+    cones = [clarabel.PSDTriangleConeT(program.n)] * program.cones
+    return solve_conic(program.cost, program.rows, program.right, cones)
+
+
+def solve_conic(
+    cost: FloatArray, rows: sparse.csc_matrix, right: FloatArray, cones: Sequence[Any]
+) -> tuple[FloatArray | None, str]:
+    """Minimise cost'z subject to right - rows z in a product of cones, in one thread.
+
+    An almost solved program counts as solved: every metric and every tube is checked afterwards.
+
+    Args:
+        cost: Shape (z,).
+        rows: Shape (entries of all cones, z).
+        right: Shape (entries of all cones,).
+        cones: Clarabel's, in the order of the rows.
+
+    Returns:
+        z, shape (z,), or None where it was not found, and the solver's status.
+    """
+    import clarabel
+
     settings: Any = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
-    cones = [clarabel.PSDTriangleConeT(program.n)] * program.cones
-    size = program.cost.size
-    quadratic = sparse.csc_matrix((size, size))
-    solver = clarabel.DefaultSolver(
-        quadratic, program.cost, program.rows, program.right, cones, settings
-    )
-    answer = solver.solve()
+    quadratic = sparse.csc_matrix((cost.size, cost.size))
+    answer = clarabel.DefaultSolver(quadratic, cost, rows, right, cones, settings).solve()
     status = str(answer.status)
-    # An almost solved program is accepted only because every metric is verified afterwards.
-    if status not in ("Solved", "AlmostSolved"):
-        return None, status
-    return np.array(answer.x), status
+    return (np.array(answer.x) if status in ("Solved", "AlmostSolved") else None), status

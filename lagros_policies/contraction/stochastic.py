@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_not_negative, check_positive
 from lagros_envs.dynamics import System, hold_step
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.double_integrator import AxisMetric
@@ -59,10 +60,10 @@ class MeanSquareBound:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if not (0.0 < self.rate < math.inf and 0.0 < self.least_eigenvalue < math.inf):
-            raise ValueError(f"{self.rate=!r} and {self.least_eigenvalue=!r} must be > 0")
-        if not (0.0 <= self.power < math.inf and 0.0 <= self.initial_energy < math.inf):
-            raise ValueError(f"{self.power=!r} and {self.initial_energy=!r} must be >= 0")
+        for name in ("rate", "least_eigenvalue"):
+            check_positive(name, getattr(self, name))
+        for name in ("power", "initial_energy"):
+            check_not_negative(name, getattr(self, name))
 
     def energy(self, time: Any) -> FloatArray:
         """Return the bound of E V at times [s], an array of their shape."""

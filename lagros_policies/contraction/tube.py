@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_above, check_at_least, check_not_negative, check_positive
 from lagros_policies.contraction.metric import ContractionMetric, extreme_eigenvalues
 
 FloatArray = NDArray[np.float64]
@@ -42,14 +43,11 @@ class Tube:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if not (math.isfinite(self.contraction_rate) and self.contraction_rate > 0.0):
-            raise ValueError(f"contraction_rate={self.contraction_rate!r} must be positive")
-        if not (math.isfinite(self.condition) and self.condition >= 1.0):
-            raise ValueError(f"condition={self.condition!r} must be at least 1")
+        check_positive("contraction_rate", self.contraction_rate)
+        check_positive("condition", self.condition)
+        check_at_least("condition", self.condition, 1)
         for name in ("disturbance_bound", "learning_error", "control_gain", "initial_radius"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name}={value!r} must be finite and >= 0")
+            check_not_negative(name, getattr(self, name))
 
     @property
     def steady_radius(self) -> float:
@@ -117,8 +115,7 @@ def diverging_bound(
     Raises:
         ValueError: The Lipschitz constant is not positive.
     """
-    if not lipschitz > 0.0:
-        raise ValueError(f"lipschitz={lipschitz!r} must be positive")
+    check_above("lipschitz", lipschitz, 0)
     push = control_gain * learning_error + disturbance_bound
     growth = np.expm1(lipschitz * time)
     bound: FloatArray = initial_error * (growth + 1.0) + push / lipschitz * growth

@@ -21,18 +21,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from lagros_envs.checks import check_not_negative, check_positive
 from lagros_envs.dynamics import System, control_matrix, jacobian
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.proof.condition import ProofBox
-from lagros_policies.contraction.semidefinite import svec, symmetric_basis
+from lagros_policies.contraction.semidefinite import solve_conic, svec, symmetric_basis
 
 FloatArray = NDArray[np.float64]
 Method = Literal["paper", "output", "ellipsoid"]
@@ -68,10 +69,8 @@ class PlanBox:
 
     def __post_init__(self) -> None:
         """Check the bounds."""
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name}={value!r} must be finite and >= 0")
+        for item in fields(self):
+            check_not_negative(item.name, getattr(self, item.name))
 
     def with_errors(self, error: FloatArray) -> ProofBox:
         """Return the box of x and x_d for errors of at most `error`, shape (4,).
@@ -119,11 +118,8 @@ class TubeDesign:
     def __post_init__(self) -> None:
         """Check the values."""
         for name in ("rate", "disturbance_bound", "control_penalty", "floor"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name}={value!r} must be positive and finite")
-        if not (math.isfinite(self.margin) and self.margin >= 0.0):
-            raise ValueError(f"margin={self.margin!r} must be finite and >= 0")
+            check_positive(name, getattr(self, name))
+        check_not_negative("margin", self.margin)
         if self.method == "output" and self.output is None:
             raise ValueError("output=None: method='output' needs the direction c")
         if self.method == "paper" and self.output is not None:
@@ -364,21 +360,9 @@ def _solve(
     cost = np.zeros(size + 2)
     unit = design.disturbance_bound**2 if design.method == "ellipsoid" else 1.0
     cost[-2:] = design.control_penalty * unit, 1.0
-    options: Any = clarabel.DefaultSettings()
-    options.verbose = False
-    options.max_threads = 1
-    answer = clarabel.DefaultSolver(
-        sparse.csc_matrix((size + 2, size + 2)),
-        cost,
-        sparse.csc_matrix(np.vstack(blocks)),
-        np.concatenate(rights),
-        cones,
-        options,
-    ).solve()
-    status = str(answer.status)
-    # An almost solved program is accepted only because every tube is proved afterwards.
-    if status not in ("Solved", "AlmostSolved"):
+    rows = sparse.csc_matrix(np.vstack(blocks))
+    values, status = solve_conic(cost, rows, np.concatenate(rights), cones)
+    if values is None:
         return None, 0.0, status
-    values = np.array(answer.x)
     dual = np.einsum("j,jab->ab", values[:size], basis)
     return dual, float(values[size]), status

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_positive
 from lagros_envs.dynamics.spacecraft import Spacecraft
 from lagros_policies.contraction.double_integrator import AxisMetric, design_axis, flow
 from lagros_policies.contraction.thrusters import held_thrust
@@ -126,8 +127,7 @@ class WrenchTracking:
         """
         rates = {"contraction_rate": contraction_rate, "turning_rate": turning_rate}
         for name, rate in rates.items():
-            if not 0.0 < rate < np.inf:
-                raise ValueError(f"{name}={rate!r} must be positive and finite")
+            check_positive(name, rate)
         return cls(body, design_axis(contraction_rate, period), design_axis(turning_rate, period))
 
     def acceleration(

@@ -111,8 +111,7 @@ class SpacecraftSource:
     def radii(self) -> tuple[float, float]:
         """Radii of an agent against other agents and against obstacles [m]."""
         preset = self.policy.preset
-        core = preset.agent_radius if preset.core_radius is None else preset.core_radius
-        return preset.agent_radius, core
+        return preset.agent_radius, preset.core
 
     @property
     def inputs(self) -> int:
@@ -214,7 +213,6 @@ def example_sensed(policy: SpacecraftNetworkPolicy, count: int, seed: int = 0) -
     rng = np.random.default_rng(seed)
     settings, preset, layout = policy.settings, policy.preset, policy.layout
     at, reach = layout.slices, settings.sensing_radius
-    core = preset.agent_radius if preset.core_radius is None else preset.core_radius
     rows = np.zeros((count, layout.size), np.float32)
     rows[:, at["goal"]] = _around(rng, np.zeros(count), 6.0)
     rows[:, at["velocity"]] = _around(rng, np.zeros(count), 0.5)
@@ -226,7 +224,7 @@ def example_sensed(policy: SpacecraftNetworkPolicy, count: int, seed: int = 0) -
     touch = np.full((count, layout.neighbours), 2.0 * preset.agent_radius)
     neighbours = [_around(rng, 0.9 * touch, reach), _around(rng, 0.0 * touch, 0.8)]
     radii = preset.obstacle_radius * rng.uniform(0.6, 1.4, (count, layout.obstacles))
-    obstacles = [_around(rng, 0.9 * (radii + core), reach + radii), radii[..., None]]
+    obstacles = [_around(rng, 0.9 * (radii + preset.core), reach + radii), radii[..., None]]
     for parts, name in ((neighbours, "neighbour"), (obstacles, "obstacle")):
         slots = np.concatenate(parts, axis=-1)
         sensed = rng.random(slots.shape[:2]) < 0.5

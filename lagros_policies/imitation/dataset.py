@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
+from lagros_envs.checks import check_at_least, check_not_negative
 from lagros_envs.disturbances import OPEN_LOOP, into_unit_ball
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
@@ -63,8 +64,10 @@ class ExpertDataSettings:
             raise ValueError(
                 f"shards={self.shards} must divide plans={self.plans} and samples={self.samples}"
             )
-        if min(self.plans, self.samples) < 1 or self.disturbance_bound < 0.0 or self.spread < 0.0:
-            raise ValueError("plans and samples must be positive, bound and spread >= 0")
+        for name in ("plans", "samples"):
+            check_at_least(name, getattr(self, name), 1)
+        for name in ("disturbance_bound", "spread"):
+            check_not_negative(name, getattr(self, name))
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_at_least, check_not_negative, check_seed
 from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.observation import global_state
 from lagros_envs.seeding import episode_seeds
@@ -59,17 +60,15 @@ class DemonstrationSettings:
         """Check the values."""
         if self.task not in ENVIRONMENTS:
             raise ValueError(f"task={self.task!r} must be one of {', '.join(ENVIRONMENTS)}")
-        if self.episodes < 1:
-            raise ValueError(f"episodes={self.episodes!r} must be at least 1")
-        if self.seed < 0:
-            raise ValueError(f"seed={self.seed!r} must be a non-negative integer")
+        check_at_least("episodes", self.episodes, 1)
+        check_seed(self.seed)
         if self.disturbance not in OPEN_LOOP:
             raise ValueError(
                 f"disturbance={self.disturbance!r} must be one of {', '.join(OPEN_LOOP)}: whoever "
                 "reads the data must be able to repeat it without the expert's plan"
             )
-        if self.bound is not None and not (math.isfinite(self.bound) and self.bound >= 0.0):
-            raise ValueError(f"bound={self.bound!r} must be finite and >= 0")
+        if self.bound is not None:
+            check_not_negative("bound", self.bound, "or None for the task's own")
 
     @property
     def disturbance_bound(self) -> float:

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_above, check_at_least, check_each, check_not_negative
 from lagros_envs.observation import Layout, observe
 from lagros_envs.scenarios import Preset, preset_named
 from lagros_envs.seeding import episode_seeds, episode_streams
@@ -76,14 +77,13 @@ class FlightSettings:
             raise ValueError(
                 f"worlds_per_shard={self.worlds_per_shard} must divide worlds={self.worlds}"
             )
-        if not self.agents or min(self.agents) < 1 or self.sample_every < 1:
-            raise ValueError(
-                f"agents={self.agents!r} and sample_every={self.sample_every!r} must be at least 1"
-            )
-        if not (0.0 <= self.open_share <= 1.0 and 0.0 <= self.disturbance_bound < np.inf):
-            raise ValueError("open_share must be in [0, 1] and disturbance_bound >= 0")
-        if self.replan_period is not None and not self.replan_period > 0.0:
-            raise ValueError(f"replan_period={self.replan_period!r} must be > 0, or None")
+        check_each("agents", self.agents, 1)
+        check_at_least("sample_every", self.sample_every, 1)
+        check_not_negative("disturbance_bound", self.disturbance_bound)
+        if not 0.0 <= self.open_share <= 1.0:
+            raise ValueError(f"open_share={self.open_share!r} must be in [0, 1]")
+        if self.replan_period is not None:
+            check_above("replan_period", self.replan_period, 0, "or None")
 
     @property
     def shards(self) -> int:

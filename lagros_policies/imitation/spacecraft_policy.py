@@ -56,8 +56,7 @@ class SpacecraftNetworkPolicy:
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
         self.network = DeepSet.load(PRETRAINED / self.weights_file if weights is None else weights)
-        core = self.preset.core_radius
-        self._radii = self.preset.agent_radius, self.preset.agent_radius if core is None else core
+        self._radii = self.preset.agent_radius, self.preset.core
 
     def predict(
         self,

@@ -1,24 +1,19 @@
-"""Fit a network to expert data; interrupted, it goes on from its last checkpoint.
-
-The order of the samples in epoch k depends on (seed, k) alone, so that a resumed run gives the
-weights that an uninterrupted one gives, bit for bit on the same machine.
-"""
+"""Fit a network to expert data; interrupted, it goes on from its last checkpoint."""
 
 from __future__ import annotations
 
 import hashlib
 import itertools
-import json
-import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_policies.imitation.checkpoint import load_progress, save_progress
+from lagros_envs.checks import check_at_least, check_each, check_positive
+from lagros_policies.imitation.fitting import Fit, IntArray, one_thread
 from lagros_policies.imitation.networks import Mlp
 
 if TYPE_CHECKING:
@@ -55,12 +50,12 @@ class TrainingSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if not self.hidden or min(self.hidden) < 1:
-            raise ValueError(f"hidden={self.hidden!r} must name at least one positive width")
-        if min(self.epochs, self.batch, self.checkpoint_every) < 1:
-            raise ValueError("epochs, batch and checkpoint_every must be at least 1")
-        if not (0.0 < self.held_out < 1.0 and self.learning_rate > 0.0):
-            raise ValueError("held_out must be in (0, 1) and learning_rate > 0")
+        check_each("hidden", self.hidden, 1)
+        for name in ("epochs", "batch", "checkpoint_every"):
+            check_at_least(name, getattr(self, name), 1)
+        check_positive("learning_rate", self.learning_rate)
+        if not 0.0 < self.held_out < 1.0:
+            raise ValueError(f"held_out={self.held_out!r} must be in (0, 1)")
 
 
 @dataclass(frozen=True)
@@ -110,26 +105,14 @@ def fit(
     Returns:
         The network, with the normalisation folded in.
     """
-    import torch
-
-    # More threads are slower at this size, and one makes the sums repeatable.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_thread():
         run = _Run(features, labels, settings, checkpoint)
-        while run.epoch < settings.epochs:
-            loss = run.one_epoch()
-            if run.epoch % settings.checkpoint_every == 0 or run.epoch == settings.epochs:
-                run.save()
-            if on_epoch is not None:
-                on_epoch(run.epoch, loss)
+        run.finish(on_epoch)
         return run.network()
-    finally:
-        torch.set_num_threads(threads)
 
 
-class _Run:
-    """One training run: model, optimiser and the number of epochs done."""
+class _Run(Fit[TrainingSettings]):
+    """A run over features and labels, each scaled to mean zero and deviation one."""
 
     def __init__(
         self,
@@ -140,8 +123,6 @@ class _Run:
     ) -> None:
         import torch
 
-        self.settings = settings
-        self.checkpoint = checkpoint
         self.input_mean, self.input_scale = _statistics(features)
         self.output_mean, self.output_scale = _statistics(labels)
         self.features = torch.from_numpy((features - self.input_mean) / self.input_scale)
@@ -152,36 +133,22 @@ class _Run:
         for width, following in itertools.pairwise(widths):
             layers += [torch.nn.Linear(width, following), torch.nn.Tanh()]
         self.model = torch.nn.Sequential(*layers[:-1])
-        self.optimiser = torch.optim.Adam(self.model.parameters(), lr=settings.learning_rate)
         data = hashlib.sha256(features.tobytes() + labels.tobytes()).hexdigest()
-        self._fingerprint = json.dumps({"settings": asdict(settings), "data": data})
-        self.epoch = load_progress(
-            checkpoint, list(self.model.parameters()), self.optimiser, self._fingerprint
-        )
+        super().__init__(settings, checkpoint, list(self.model.parameters()), len(features), data)
 
-    def one_epoch(self) -> float:
-        """Pass once over the data and return the mean loss."""
+    def batches(self, order: IntArray) -> list[IntArray]:
+        """Cut off full batches; the last one holds the rest."""
+        size = self.settings.batch
+        return [order[first : first + size] for first in range(0, len(order), size)]
+
+    def loss(self, batch: IntArray) -> torch.Tensor:
+        """Return the mean of ||u_L - u*|| over a batch."""
         import torch
 
-        settings = self.settings
-        rng = np.random.default_rng([settings.seed, self.epoch])
-        order = torch.from_numpy(rng.permutation(len(self.features)))
-        batches = torch.split(order, settings.batch)
-        total = 0.0
-        for index, batch in enumerate(batches):
-            progress = (self.epoch + index / len(batches)) / settings.epochs
-            rate = settings.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
-            self.optimiser.param_groups[0]["lr"] = rate
-            error = self.model(self.features[batch]) - self.labels[batch]
-            # The paper's loss is the norm of the error; smoothed at zero so that it has a gradient.
-            size = torch.sqrt((error * error).sum(1) + 1e-6)
-            loss = size.mean()
-            self.optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            self.optimiser.step()
-            total += float(loss.detach()) * len(batch)
-        self.epoch += 1
-        return total / len(self.features)
+        rows = torch.from_numpy(batch)
+        error = self.model(self.features[rows]) - self.labels[rows]
+        # The paper's loss is the norm of the error; smoothed at zero so that it has a gradient.
+        return torch.sqrt((error * error).sum(1) + 1e-6).mean()
 
     def network(self) -> Mlp:
         """Return the network with the normalisation folded into its first and last layer."""
@@ -192,16 +159,6 @@ class _Run:
         weights[-1] = weights[-1] * self.output_scale
         biases[-1] = biases[-1] * self.output_scale + self.output_mean
         return Mlp(weights, biases)
-
-    def save(self) -> None:
-        """Write model and optimiser."""
-        save_progress(
-            self.checkpoint,
-            list(self.model.parameters()),
-            self.optimiser,
-            self._fingerprint,
-            self.epoch,
-        )
 
 
 def _statistics(values: Float32Array) -> tuple[Float32Array, Float32Array]:

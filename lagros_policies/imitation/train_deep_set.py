@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import json
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_at_least, check_each, check_positive
 from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_policies.imitation.checkpoint import load_progress, save_progress
 from lagros_policies.imitation.deep_set import OUTPUTS, DeepSet
+from lagros_policies.imitation.fitting import Fit, IntArray, one_thread
 from lagros_policies.imitation.spacecraft_features import (
     NEIGHBOUR,
     OBSTACLE,
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -68,15 +66,11 @@ class DeepSetTraining:
     def __post_init__(self) -> None:
         """Check the values."""
         for name in ("element", "agent"):
-            widths = getattr(self, name)
-            if not widths or min(widths) < 1:
-                raise ValueError(f"{name}={widths!r} must name at least one positive width")
-        if min(self.epochs, self.batch, self.checkpoint_every) < 1:
-            raise ValueError("epochs, batch and checkpoint_every must be at least 1")
-        if not (self.learning_rate > 0.0 and self.outlier > 0.0):
-            raise ValueError(
-                f"learning_rate={self.learning_rate!r} and outlier={self.outlier!r} must be > 0"
-            )
+            check_each(name, getattr(self, name), 1)
+        for name in ("epochs", "batch", "checkpoint_every"):
+            check_at_least(name, getattr(self, name), 1)
+        for name in ("learning_rate", "outlier"):
+            check_positive(name, getattr(self, name))
 
 
 @dataclass(frozen=True)
@@ -179,30 +173,18 @@ def fit_deep_set(
     Returns:
         The network, with the normalisation folded in.
     """
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_thread():
         run = _Run(samples, settings, checkpoint)
-        while run.epoch < settings.epochs:
-            loss = run.one_epoch()
-            if run.epoch % settings.checkpoint_every == 0 or run.epoch == settings.epochs:
-                run.save()
-            if on_epoch is not None:
-                on_epoch(run.epoch, loss)
+        run.finish(on_epoch)
         return run.network()
-    finally:
-        torch.set_num_threads(threads)
 
 
-class _Run:
-    """One training run: model, optimiser and the number of epochs done."""
+class _Run(Fit[DeepSetTraining]):
+    """A run over samples whose inputs and labels are scaled."""
 
     def __init__(self, samples: SetSamples, settings: DeepSetTraining, checkpoint: Path) -> None:
         import torch
 
-        self.settings, self.checkpoint = settings, checkpoint
         features, count = samples.features, len(samples)
         inputs = features.own, features.neighbours.values, features.obstacles.values
         self.scales = [_statistics(values) for values in inputs]
@@ -224,35 +206,24 @@ class _Run:
             _layers([len(OBSTACLE), *settings.element]),
             _layers([len(OWN) + 2 * wide, *settings.agent, OUTPUTS])[:-1],
         ]
-        self.parameters = [value for part in self.parts for value in part.parameters()]
-        self.optimiser = torch.optim.Adam(self.parameters, lr=settings.learning_rate)
         data = hashlib.sha256()
         for array in (own, neighbours, obstacles, self.target):
             data.update(np.ascontiguousarray(array).tobytes())
-        self._fingerprint = json.dumps({"settings": asdict(settings), "data": data.hexdigest()})
-        self.epoch = load_progress(checkpoint, self.parameters, self.optimiser, self._fingerprint)
+        parameters = [value for part in self.parts for value in part.parameters()]
+        super().__init__(settings, checkpoint, parameters, count, data.hexdigest())
 
-    def one_epoch(self) -> float:
-        """Pass once over the data and return the mean loss."""
+    def batches(self, order: IntArray) -> list[IntArray]:
+        """Cut into batches of almost equal sizes."""
+        return np.array_split(order, max(1, len(order) // self.settings.batch))
+
+    def loss(self, batch: IntArray) -> torch.Tensor:
+        """Return the mean Huber loss of a batch."""
         import torch
 
-        settings = self.settings
-        order = np.random.default_rng([settings.seed, self.epoch]).permutation(len(self.target))
-        batches = np.array_split(order, max(1, len(order) // settings.batch))
-        total = 0.0
-        for index, batch in enumerate(batches):
-            progress = (self.epoch + index / len(batches)) / settings.epochs
-            rate = settings.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
-            self.optimiser.param_groups[0]["lr"] = rate
-            target = torch.from_numpy(self.target[batch])
-            answer = self._forward(batch)
-            loss = torch.nn.functional.smooth_l1_loss(answer, target, beta=settings.outlier)
-            self.optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            self.optimiser.step()
-            total += float(loss.detach()) * len(batch)
-        self.epoch += 1
-        return total / len(self.target)
+        target = torch.from_numpy(self.target[batch])
+        return torch.nn.functional.smooth_l1_loss(
+            self._forward(batch), target, beta=self.settings.outlier
+        )
 
     def _forward(self, batch: IntArray) -> torch.Tensor:
         import torch
@@ -283,12 +254,6 @@ class _Run:
         weight, bias = parts[2][-1]
         parts[2][-1] = weight * self.target_scale, bias * self.target_scale
         return DeepSet(parts[0], parts[1], parts[2])
-
-    def save(self) -> None:
-        """Write model and optimiser."""
-        save_progress(
-            self.checkpoint, self.parameters, self.optimiser, self._fingerprint, self.epoch
-        )
 
 
 def _layers(widths: list[int]) -> torch.nn.Sequential:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.cartpole_task import FALL_ANGLE, CartPoleSettings
+from lagros_envs.checks import check_positive
 from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_policies.contraction.tube import tighten
 from lagros_policies.planning.scp import ScpSettings, ScpSolver
@@ -43,8 +43,7 @@ class CartPolePlannerSettings:
         """Check the values."""
         if not 0.0 <= self.angle_margin < FALL_ANGLE:
             raise ValueError(f"angle_margin={self.angle_margin!r} must be in [0, pi/2)")
-        if not (math.isfinite(self.margin_rate) and self.margin_rate > 0.0):
-            raise ValueError(f"margin_rate={self.margin_rate!r} must be positive")
+        check_positive("margin_rate", self.margin_rate)
 
 
 class CartPolePlanner:

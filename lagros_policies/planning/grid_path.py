@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
+from lagros_envs.checks import check_not_negative, check_positive
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
@@ -48,11 +50,9 @@ class GridSettings:
     def __post_init__(self) -> None:
         """Check the values."""
         for item in fields(self):
-            value = getattr(self, item.name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{item.name}={value!r} must be finite and >= 0")
-        if not (self.cell > 0.0 and self.search_cell > 0.0 and self.search_period > 0.0):
-            raise ValueError("cell, search_cell and search_period must be > 0")
+            check_not_negative(item.name, getattr(self, item.name))
+        for name in ("cell", "search_cell", "search_period"):
+            check_positive(name, getattr(self, name))
         if self.preference >= 1.0:
             raise ValueError(f"preference={self.preference!r} must be below 1")
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_above
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
@@ -44,9 +46,7 @@ class JointScpSettings:
     def __post_init__(self) -> None:
         """Check the values."""
         for item in fields(self):
-            value = getattr(self, item.name)
-            if not value > 0:
-                raise ValueError(f"{item.name}={value!r} must be > 0")
+            check_above(item.name, getattr(self, item.name), 0)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 import piqp
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_not_negative, check_positive, check_whole
 from lagros_policies.planning.grid_path import walk
 from lagros_policies.planning.local_guess import pass_aside, progress, way_around
 from lagros_policies.planning.local_motion import (
@@ -79,12 +80,9 @@ class LocalPlannerSettings:
     def __post_init__(self) -> None:
         """Check the values."""
         for item in fields(self):
-            value = getattr(self, item.name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{item.name}={value!r} must be finite and >= 0")
+            check_not_negative(item.name, getattr(self, item.name))
         for name in ("mass", "near_period", "speed_limit", "penalty", "qp_tolerance"):
-            if getattr(self, name) == 0.0:
-                raise ValueError(f"{name}=0.0 must be > 0")
+            check_positive(name, getattr(self, name))
         # The second pass is the first that may know of the speed limit.
         for name, least in (
             ("near_steps", 1),
@@ -92,9 +90,7 @@ class LocalPlannerSettings:
             ("passes", 2),
             ("most_distances", 1),
         ):
-            value = getattr(self, name)
-            if value != int(value) or value < least:
-                raise ValueError(f"{name}={value!r} must be a whole number >= {least}")
+            check_whole(name, getattr(self, name), least)
         if self.least_duration <= self.foresight:
             raise ValueError(
                 f"least_duration={self.least_duration!r} must exceed the {self.near_steps} steps "

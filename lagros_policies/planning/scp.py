@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from lagros_envs.checks import check_above
 from lagros_envs.dynamics import System, hold_step, linearise_hold
 from lagros_policies.planning.qp import UNBOUNDED, QuadraticProgram, solve_qp
 from lagros_policies.planning.trajectory import Trajectory
@@ -54,9 +55,7 @@ class ScpSettings:
     def __post_init__(self) -> None:
         """Check the values."""
         for item in fields(self):
-            value = getattr(self, item.name)
-            if not value > 0:
-                raise ValueError(f"{item.name}={value!r} must be > 0")
+            check_above(item.name, getattr(self, item.name), 0)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_at_least, check_not_negative, check_positive
 from lagros_policies.planning.grid_path import (
     GridSettings,
     search_in_turn,
@@ -85,18 +86,14 @@ class SpacecraftPlannerSettings:
     def __post_init__(self) -> None:
         """Check the values."""
         for name in ("horizon", "control_period", "mass", "speed_limit", "check_period"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name}={value!r} must be positive and finite")
+            check_positive(name, getattr(self, name))
         for name in ("pair_share", "margin_growth", "start_margin"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name}={value!r} must be finite and >= 0")
+            check_not_negative(name, getattr(self, name))
         falling = sorted(self.margins, reverse=True)
         if not self.margins or list(self.margins) != falling or not 0.0 <= falling[-1] < math.inf:
             raise ValueError(f"margins={self.margins!r} must be falling numbers >= 0, at least one")
-        if self.nodes < 2 or self.candidates < 1 or self.restarts < 0 or self.searches < 0:
-            raise ValueError("nodes must be >= 2, candidates >= 1, restarts and searches >= 0")
+        for name, least in (("nodes", 2), ("candidates", 1), ("restarts", 0), ("searches", 0)):
+            check_at_least(name, getattr(self, name), least)
         divisor("control_period", self.control_period, self.node_period)
         divisor("check_period", self.check_period, self.node_period)
 
@@ -358,8 +355,10 @@ def _scene(
         if not np.all(np.isfinite(array)):
             raise ValueError(f"{name} must be finite")
     core = agent_radius if core_radius is None else core_radius
-    if not (0.0 < agent_radius < math.inf and 0.0 <= core < math.inf and np.all(radius > 0.0)):
-        raise ValueError("agent_radius and every obstacle_radius must be > 0, core_radius >= 0")
+    check_positive("agent_radius", agent_radius)
+    check_not_negative("core_radius", core, "or None for agent_radius")
+    if not np.all(radius > 0.0):
+        raise ValueError(f"obstacle_radius={radius.tolist()} must be > 0")
     if begin.shape[1] == 2:
         begin = np.hstack([begin, np.zeros_like(begin)])
     return _Scene(

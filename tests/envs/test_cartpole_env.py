@@ -350,7 +350,7 @@ def test_a_shorter_episode_has_fewer_steps():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"control_period": 0.0}, "control_period=0.0 must be > 0"),
+        ({"control_period": 0.0}, "control_period=0.0 must be finite and > 0"),
         ({"time_limit": 9.05}, "whole number"),
         ({"time_limit": -9}, "time_limit=-9"),
         ({"force_limit": 0.0}, "None for no limit"),

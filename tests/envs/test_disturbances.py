@@ -261,6 +261,14 @@ def test_an_unknown_kind_is_refused_with_the_list_of_kinds():
     assert set(KINDS) == {*OPEN_LOOP, "worst"}
 
 
+@pytest.mark.parametrize("kind", OPEN_LOOP)
+def test_an_open_loop_kind_is_drawn_and_answers_no_state(kind):
+    disturbance = Disturbance(kind, 0.5, ALL)
+    assert disturbance.feedback is None
+    with pytest.raises(ValueError, match=f"disturbance='{kind}' does not respond to states"):
+        disturbance.respond(situation(np.zeros(4)))
+
+
 @pytest.mark.parametrize("bound", [-0.1, math.inf, math.nan])
 def test_a_bound_that_bounds_nothing_is_refused(bound):
     with pytest.raises(ValueError, match="disturbance_bound="):

@@ -160,10 +160,10 @@ def test_mirrored_state_and_force_give_mirrored_rates():
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("pole_mass", 0.0, "pole_mass=0.0 must be a finite number > 0"),
+        ("pole_mass", 0.0, "pole_mass=0.0 must be finite and > 0"),
         ("half_length", -0.5, "half_length=-0.5"),
         ("gravity", math.inf, "gravity=inf"),
-        ("cart_friction", -1e-9, "cart_friction=-1e-09 must be a finite number >= 0"),
+        ("cart_friction", -1e-9, "cart_friction=-1e-09 must be finite and >= 0"),
         ("pole_friction", math.nan, "pole_friction=nan"),
     ],
 )

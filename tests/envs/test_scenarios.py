@@ -43,6 +43,7 @@ def test_every_preset_samples_what_it_promises(name):
     preset = PRESETS[name]
     for sample in drawn(name):
         assert sample.num_agents == 6
+        assert (sample.agent_radius, sample.core) == (preset.agent_radius, preset.core)
         assert preset.obstacle_count[0] <= len(sample.obstacles) <= preset.obstacle_count[1]
         assert np.all(np.linalg.norm(sample.starts - sample.goals, axis=1) >= preset.least_way)
         room = 2.0 * (sample.agent_radius + preset.margin)
@@ -59,10 +60,11 @@ def test_every_preset_samples_what_it_promises(name):
         assert np.all(np.abs(sample.headings) <= preset.heading_range)
 
 
-def test_the_presets_are_those_of_the_issue():
+def test_the_presets_are_the_paper_and_its_released_code():
     paper, released = drawn("paper", seeds=range(60)), drawn("released", seeds=range(5))
     assert {len(sample.obstacles) for sample in paper} == {3, 4, 5, 6}
     assert all(sample.agent_radius == 0.25 and sample.core == 0.25 for sample in paper)
+    assert (PRESETS["paper"].core, PRESETS["released"].core) == (0.25, 0.0)
     assert np.ptp([sample.headings[0] for sample in paper]) > 5.0
     for sample in released:
         assert 2.0 * sample.agent_radius == 1.0

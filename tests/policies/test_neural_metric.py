@@ -213,7 +213,7 @@ def test_shipped_metric_holds_on_states_of_its_own():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: replace(random_metric(0), contraction_rate=0.0), "alpha"),
+        (lambda: replace(random_metric(0), contraction_rate=0.0), "contraction_rate=0"),
         (lambda: replace(random_metric(0), scaling=np.ones(3)), "scaling"),
         (
             lambda: replace(random_metric(0), network=Mlp([np.ones((2, 10))], [np.zeros(10)])),

@@ -420,7 +420,7 @@ def test_errors_name_what_is_wrong():
         filter_of(None, disturbance_bound=-1.0)
     with pytest.raises(ValueError, match=r"pair_margin=nan"):
         BarrierSettings(pair_margin=float("nan"))
-    with pytest.raises(ValueError, match=r"braking=0\.0 must be > 0"):
+    with pytest.raises(ValueError, match=r"braking=0\.0 must be finite and > 0"):
         BarrierSettings(braking=0.0)
     with pytest.raises(ValueError, match=r"pair_rate=11\.0 1/s must be at most"):
         filter_of(None, barrier=BarrierSettings(pair_rate=11.0))

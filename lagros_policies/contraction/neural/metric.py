@@ -25,6 +25,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_positive
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.metric import (
     Region,
@@ -76,13 +77,12 @@ class NeuralMetric:
                 f"the network has {self.network.inputs} inputs and {self.network.outputs} outputs; "
                 f"a Cholesky factor of size {SIZE} needs 1 and {OUTPUTS}"
             )
-        numbers = (self.contraction_rate, self.condition_bound, self.control_weight, *self.scaling)
-        if self.scaling.shape != (SIZE,) or not all(0.0 < n < math.inf for n in numbers):
-            raise ValueError(
-                f"alpha={self.contraction_rate!r}, chi={self.condition_bound!r}, "
-                f"nu={self.control_weight!r} and the {SIZE} entries of "
-                f"scaling={self.scaling!r} must be finite and > 0"
-            )
+        for name in ("contraction_rate", "condition_bound", "control_weight"):
+            check_positive(name, getattr(self, name))
+        if self.scaling.shape != (SIZE,):
+            raise ValueError(f"scaling has shape {self.scaling.shape}; it must be ({SIZE},)")
+        for entry in self.scaling:
+            check_positive("scaling", entry)
 
     def matrix(self, state: FloatArray) -> FloatArray:
         """Return M(x), shape (..., 4, 4), for states (..., 4)."""

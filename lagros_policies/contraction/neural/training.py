@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_at_least, check_each, check_not_negative, check_positive
 from lagros_envs.dynamics import System, control_matrix, state_dependent_coefficient
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.cvstem import Samples
@@ -65,12 +66,11 @@ class NeuralTrainingSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if not self.hidden or min(*self.hidden, self.fit_steps, self.batch) < 1:
-            raise ValueError(f"{self!r}: hidden layers, fit_steps and batch must be >= 1")
-        if self.condition_steps < 0:
-            raise ValueError(f"condition_steps={self.condition_steps!r} must be >= 0")
-        if not (self.learning_rate > 0.0 and self.margin >= 0.0):
-            raise ValueError(f"{self.learning_rate=!r} must be > 0 and {self.margin=!r} >= 0")
+        check_each("hidden", self.hidden, 1)
+        for name, least in (("fit_steps", 1), ("batch", 1), ("condition_steps", 0)):
+            check_at_least(name, getattr(self, name), least)
+        check_positive("learning_rate", self.learning_rate)
+        check_not_negative("margin", self.margin)
 
 
 def fit_network(
