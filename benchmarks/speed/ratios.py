@@ -67,21 +67,22 @@ class Duel:
         return self.theirs / self.ours[name].median
 
     def rows(self) -> list[Row]:
-        """Return a line for each of ours and one for the peer."""
-        rows = [
+        """Return a line for the peer and one for each of ours."""
+        label = f"{self.title}: {self.peer}"
+        if isinstance(self.theirs, Times):
+            peer = timed_row(label, self.theirs, None)
+        else:
+            peer = Row(label, self.theirs, remark="quoted")
+        return [peer] + [
             timed_row(
-                f"{self.title}: {name}",
+                f"  {name}",
                 times,
                 None,
-                f"{self.speed(name):.3g} times as fast as {self.peer}",
+                f"{self.speed(name):.3g} ×",
                 times_as_fast=self.speed(name),
             )
             for name, times in self.ours.items()
         ]
-        label = f"{self.title}: {self.peer}"
-        if isinstance(self.theirs, Times):
-            return [*rows, timed_row(label, self.theirs, None)]
-        return [*rows, Row(label, self.theirs, remark="quoted, not measured in this run")]
 
     def targets(self) -> list[Target]:
         """Return what is asked, of every variant."""
@@ -121,7 +122,7 @@ def sections(scale: Scale) -> list[Section]:
                 "these ratios were asked for), under a disturbance and with its info; "
                 "Gymnasium's takes one step of Euler. 'compiled' is numba: compiled=True for one "
                 "cart-pole, and what many worlds take by themselves where it is installed.",
-                f"Peers elsewhere: {about}.",
+                f"Quoted: not measured in this run. Peers elsewhere: {about}.",
             ],
         )
     ]

@@ -22,6 +22,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Time the batched spacecraft world.")
     parser.add_argument("--worlds", type=int, default=256)
     parser.add_argument("--agents", type=int, default=6)
+    parser.add_argument("--plain", action="store_true", help="without numba")
     options = parser.parse_args()
     rows = options.worlds * options.agents
     envs = gym.make_vec(
@@ -30,10 +31,14 @@ def main() -> None:
         num_agents=options.agents,
         disturbance="uniform",
         disturbance_bound=0.4,
+        compiled=False if options.plain else None,
         autoreset_mode="disabled",
     )
     rng = np.random.default_rng(0)
     actions = rng.uniform(0.0, 0.2, size=(_STEPS, rows, 8)).astype(np.float32)
+    # The first step compiles, or loads what was compiled.
+    envs.reset(seed=0)
+    envs.step(actions[0])
     rates = []
     for repeat in range(_REPEATS):
         envs.reset(seed=repeat)

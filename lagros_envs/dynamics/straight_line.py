@@ -57,11 +57,16 @@ class Tape:
         self._known: dict[Operation, Recorded] = {}
 
     def record(self, symbol: str, *operands: Any) -> Recorded:
-        """Note an operation and return its result.
+        """Note an operation and return its result; a product with one is the other factor.
 
         Raises:
             TypeError: An operand is neither a `Recorded` nor a finite number.
         """
+        if symbol == "*" and "1.0" in map(_text, operands):
+            first, second = operands
+            factor = second if _text(first) == "1.0" else first
+            if isinstance(factor, Recorded):
+                return factor
         operation = Operation(symbol, tuple(map(_text, operands)))
         if operation not in self._known:
             self._known[operation] = Recorded(self, f"%{len(self.operations)}")
@@ -286,8 +291,8 @@ def statements(step: StraightLine) -> tuple[list[str], list[str]]:
     What is used once is written where it is used: it never becomes a variable.
     """
     counts: dict[str, int] = {}
-    for operation in step.operations.values():
-        for operand in operation.operands:
+    for used in [*(one.operands for one in step.operations.values()), step.outputs]:
+        for operand in used:
             counts[operand] = counts.get(operand, 0) + 1
     lines: list[str] = []
     texts: dict[str, str] = {}
