@@ -55,8 +55,6 @@ class CartPoleRun(BenchmarkRun):
         forward_times: Median time of each policy's bare network [s]; None where there is none.
         times: Control instants [s].
         paper_tube: Radius of the published tube at these.
-        certified_tubes: Radius of our certified tube at these, by bound; None without certificate.
-        corrected: Policies that add a correction which that tube leaves out; it is not theirs.
     """
 
     episodes: Mapping[Case, Sequence[EpisodeRecord]]
@@ -65,8 +63,6 @@ class CartPoleRun(BenchmarkRun):
     forward_times: Mapping[str, float | None]
     times: FloatArray
     paper_tube: FloatArray
-    certified_tubes: Mapping[float, FloatArray | None]
-    corrected: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -78,8 +74,6 @@ class CartPoleExperiment:
     control_period: float
     times: FloatArray
     paper_tube: FloatArray
-    certified_tubes: Mapping[float, FloatArray | None]
-    corrected: frozenset[str]
     forward_times: Mapping[str, float | None]
 
     @classmethod
@@ -96,15 +90,11 @@ class CartPoleExperiment:
         try:
             toolbox.make_planner()
             building = "the contraction metric"
-            bounds = dict.fromkeys(condition.bound for condition in settings.conditions)
-            tubes = {b: toolbox.certified_radius(settings.metric, b, times) for b in bounds}
-            forward_times, corrected = {}, set()
+            toolbox.load_metric(settings.metric)
+            forward_times = {}
             for name in settings.policies:
                 building = f"policy {name!r}"
-                policy = make_policy(settings, toolbox, name, env)
-                forward_times[name] = forward_time(policy)
-                if getattr(policy, "largest_correction", 0.0) > 0.0:
-                    corrected.add(name)
+                forward_times[name] = forward_time(make_policy(settings, toolbox, name, env))
         except Exception as error:
             raise SetupError.building(building, error) from error
         return cls(
@@ -113,8 +103,6 @@ class CartPoleExperiment:
             control_period=task.control_period,
             times=times,
             paper_tube=np.asarray(task.tube.radius(times)),
-            certified_tubes=tubes,
-            corrected=frozenset(corrected),
             forward_times=forward_times,
         )
 
@@ -129,12 +117,11 @@ class CartPoleExperiment:
 
     def play(self, case: Case, units: Sequence[NominalPlan]) -> list[EpisodeRecord]:
         """Run episodes one after the other and return their records."""
-        certified = self.certified_tubes[case.condition.bound]
-        return self._episodes(case, units, None if case.policy in self.corrected else certified)
+        return self._episodes(case, units)
 
     def time(self, case: Case, units: Sequence[NominalPlan]) -> list[EpisodeRecord]:
         """Run episodes for their step times."""
-        return self._episodes(case, units, None)
+        return self._episodes(case, units)
 
     def finish(
         self,
@@ -155,18 +142,13 @@ class CartPoleExperiment:
             forward_times=self.forward_times,
             times=self.times,
             paper_tube=self.paper_tube,
-            certified_tubes=self.certified_tubes,
-            corrected=self.corrected,
         )
 
-    def _episodes(
-        self, case: Case, units: Sequence[NominalPlan], certified: FloatArray | None
-    ) -> list[EpisodeRecord]:
+    def _episodes(self, case: Case, units: Sequence[NominalPlan]) -> list[EpisodeRecord]:
         env = make_environment(self.settings, self.toolbox, case.condition)
         policy = make_policy(self.settings, self.toolbox, case.policy, env)
         return [
-            run_episode(env, policy, plan.seed, plan.states, label=case.policy, certified=certified)
-            for plan in units
+            run_episode(env, policy, plan.seed, plan.states, label=case.policy) for plan in units
         ]
 
 

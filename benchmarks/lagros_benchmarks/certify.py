@@ -165,7 +165,7 @@ def certify_cartpole(
     # Nothing is held against a metric that is none.
     if flights is None or found.tube.certified is None:
         return found.with_evidence(lines)
-    line, widest = evidence.tube_line(found, flights, policy, bound)
+    line, widest = evidence.tube_line(flights, policy, bound)
     calibrated = evidence.calibrated_cartpole(policy, bound, count) if count >= _LEAST else []
     return found.with_evidence([*lines, line, *calibrated], widest)
 

@@ -265,27 +265,23 @@ def met_error(
     return largest, Statement(text, "observed", holds, time.monotonic() - begun)
 
 
-def tube_line(
-    found: Certificate, flights: CartPoleFlights, policy: str, bound: float
-) -> tuple[Statement, float]:
-    """Hold flights against the certified tube; return the line and the largest ||x - x_d||."""
+def tube_line(flights: CartPoleFlights, policy: str, bound: float) -> tuple[Statement, float]:
+    """Return what flights were observed to do around x_d, and the largest ||x - x_d||.
+
+    Nothing certified is counted against them: their control is held and all states are disturbed.
+    """
     begun = time.monotonic()
     up = ~flights.fallen
     error = np.linalg.norm(flights.states - flights.plans, axis=-1)[up]
-    rate = float(found.details["disturbed_rate"])
-    rate = rate if rate > 0.0 else found.alpha
-    times = flights.period * np.arange(error.shape[1])
-    radius = float(found.tube.certified or 0.0) * -np.expm1(-rate * times)
-    crossed = int(np.count_nonzero(np.any(error > radius + 1e-6, axis=1)))
     largest = float(error.max(initial=0.0))
     fallen = int(np.count_nonzero(flights.fallen))
     text = (
         f"{policy}, held {flights.period:g} s, d_bar = {bound:g} ({', '.join(_KINDS)}): the "
         f"largest ||x - x_d|| of {len(up)} episodes is {largest:.4g}; {fallen} fell, "
-        f"{flights.unplanned} starts had no plan, {crossed} of the others left the certified tube"
+        f"{flights.unplanned} starts had no plan"
     )
     seconds = flights.seconds + time.monotonic() - begun
-    return Statement(text, "observed", crossed == 0, seconds), largest
+    return Statement(text, "observed", True, seconds), largest
 
 
 def calibrated_cartpole(policy: str, bound: float, count: int) -> Sequence[Statement]:

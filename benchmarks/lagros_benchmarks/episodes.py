@@ -41,7 +41,8 @@ class EpisodeRecord:
         effort_total: The same to the end of the episode, successful or not [N^2 s].
         left_paper_tube: ||x - x_d|| exceeded the paper tube, or the episode ended early, or it has
             no plan x_d.
-        left_certified_tube: The same for our certified tube; None where there is no certificate.
+        left_certified_tube: None: no certified tube of ours is about a flight of this task
+            (`claims`).
         max_tracking_error: The largest ||x - x_d||; None without a plan.
         counters: What the policy counts, summed over the episode.
         error: The exception that ended the episode, which is then a failure; None if none did.
@@ -61,7 +62,7 @@ class EpisodeRecord:
     effort: float
     effort_total: float
     left_paper_tube: bool
-    left_certified_tube: bool | None
+    left_certified_tube: None
     max_tracking_error: float | None
     counters: dict[str, int]
     error: str | None
@@ -126,7 +127,6 @@ def run_episode(
     nominal: FloatArray | None,
     *,
     label: str | None = None,
-    certified: FloatArray | None = None,
 ) -> EpisodeRecord:
     """Run one episode to its end.
 
@@ -139,7 +139,6 @@ def run_episode(
         seed: Seed of the episode.
         nominal: x_d at every control instant, or None if there is no plan.
         label: What to call the policy; its own name if None.
-        certified: Radius of the certified tube at every control instant, or None.
 
     Returns:
         The record of the episode.
@@ -151,7 +150,7 @@ def run_episode(
     except Exception as error:
         problem = describe_error(error)
     name = label or str(getattr(policy, "name", policy))
-    return _record(env, name, seed, trace, problem, certified)
+    return _record(env, name, seed, trace, problem)
 
 
 def _play(
@@ -187,7 +186,6 @@ def _record(
     seed: int,
     trace: _Trace,
     problem: str | None,
-    certified: FloatArray | None,
 ) -> EpisodeRecord:
     world: Any = env.unwrapped
     period = world.settings.control_period
@@ -211,7 +209,7 @@ def _record(
         effort=float(info.get("effort_to_success", 0.0)),
         effort_total=float(info.get("effort", 0.0)),
         left_paper_tube=fallen or _left(errors, np.asarray(world.settings.tube.radius(times))),
-        left_certified_tube=None if certified is None else fallen or _left(errors, certified),
+        left_certified_tube=None,
         max_tracking_error=max(trace.errors) if trace.errors else None,
         counters=trace.counters,
         error=problem,

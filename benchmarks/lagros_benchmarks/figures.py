@@ -12,7 +12,6 @@ from lagros_benchmarks import spacecraft_figures
 from lagros_benchmarks.canvas import (
     BLACK,
     LONGEST_LABEL,
-    FloatArray,
     canvas,
     caption,
     check_figure_path,
@@ -48,7 +47,7 @@ def draw(rows: Sequence[Row], path: str | Path) -> Path:
 
 
 def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
-    """Draw the mean tracking error of each policy over time against the tubes.
+    """Draw the mean tracking error of each policy over time against the paper's tube.
 
     The bands hold 80 % of the episodes. The axis is logarithmic where a mean leaves the paper's
     tube far behind.
@@ -89,17 +88,14 @@ def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
         labels.append((float(last), policy_label(name, LONGEST_LABEL), style.colour))
     axes.plot(times, tube, color=BLACK, linewidth=1.5)
     labels.append((float(tube[-1]), "paper tube r(t)", BLACK))
-    # An agent that corrects LAG-ROS has none.
-    certified = [row for row in drawn if row["certified_tube"] is not None]
-    note = _draw_certified(axes, certified[0], times, ceiling, labels) if certified else ""
     axes.set(xlim=(times[0], times[-1]), ylim=(max(floor, 1e-3) if logarithmic else 0.0, ceiling))
     if logarithmic:
-        log_ordinate(axes)  # without the zero at which both tubes begin
+        log_ordinate(axes)  # without the zero at which the tube begins
     axes.set(xlabel="time t [s]", ylabel="tracking error $\\|x - x_d\\|$  [m, rad, m/s, rad/s]")
     episodes = rows[0]["episodes"]
     axes.set_title(f"{condition_title(rows[0])}, {episodes} episodes", loc="left", fontsize=10)
     text = "lines: mean; bands: 10th to 90th percentile; a fall keeps its largest error"
-    caption(figure, text + note)
+    caption(figure, text)
     _label_ends(axes, labels)
     return save(figure, path)
 
@@ -166,22 +162,6 @@ def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
 def _columns(panels: int) -> int:
     """Return how many panels stand beside each other: up to three, or four if fewer stay empty."""
     return min(range(min(panels, 3), min(panels, 4) + 1), key=lambda columns: -panels % columns)
-
-
-def _draw_certified(
-    axes: Axes,
-    row: Row,
-    times: FloatArray,
-    ceiling: float,
-    labels: list[tuple[float, str, str]],
-) -> str:
-    """Draw the certified tube if it fits, else return a note of its size."""
-    tube = curve(row["certified_tube"])
-    if tube[-1] > ceiling:
-        return f"\nnot shown: our certified tube, which grows to {tube[-1]:.3g}"
-    axes.plot(times, tube, color=BLACK, linewidth=1, linestyle=(0, (4, 2)))
-    labels.append((float(tube[-1]), "certified tube", BLACK))
-    return ""
 
 
 def _label_ends(axes: Axes, labels: list[tuple[float, str, str]]) -> None:

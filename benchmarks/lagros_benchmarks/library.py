@@ -14,6 +14,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_benchmarks.claims import position_margin
+
 FloatArray = NDArray[np.float64]
 Environment = gym.Env[Any, Any]
 
@@ -136,26 +138,6 @@ def make_filter(policy: Any, env: Any, disturbance_bound: float) -> Policy:
     return filtered
 
 
-def position_margin(policy: Policy, disturbance_bound: float) -> float | None:
-    """Return the certified bound of the position error to x_d [m], of a policy that tracks a plan.
-
-    Args:
-        policy: The policy; None is returned unless its tracking law is one that a bound holds for:
-            u* or the sliding-variable law of a centralised policy.
-        disturbance_bound: d_bar, in units of the state per second.
-    """
-    from lagros_policies.contraction.double_integrator import certified_margin
-    from lagros_policies.contraction.lagrangian import SlidingTracking, steady_position_bound
-    from lagros_policies.contraction.wrench_control import WrenchTracking
-
-    tracking = getattr(policy, "tracking", None)
-    if isinstance(tracking, SlidingTracking):
-        return steady_position_bound(tracking.plane, disturbance_bound)
-    if not isinstance(tracking, WrenchTracking):
-        return None
-    return certified_margin(tracking.plane, disturbance_bound)
-
-
 def make_planner() -> Planner:
     """Return the planner whose cold plans are the nominal trajectories x_d of the episodes."""
     from lagros_policies.planning.cartpole import CartPolePlanner
@@ -172,28 +154,6 @@ def load_metric(path: str | None) -> Callable[[FloatArray], FloatArray]:
     return matrix
 
 
-def certified_radius(path: str | None, bound: float, times: FloatArray) -> FloatArray:
-    """Return the radius of our own certified tube at the times [s].
-
-    It is the tube of u* itself, by the paper's formula (`contraction.certified_tube` says what that
-    leaves out): a learning error would only widen it, and all policies are held against the same
-    one.
-
-    Args:
-        path: File of the metric, or None for the shipped one.
-        bound: d_bar, in units of the state per second.
-        times: Times [s].
-
-    Returns:
-        The radius at each time.
-    """
-    from lagros_policies.contraction import certified_tube
-    from lagros_policies.contraction import load_metric as load
-
-    tube = certified_tube(load(path), bound)
-    return np.asarray(tube.radius(times), dtype=np.float64)
-
-
 @dataclass(frozen=True)
 class Toolbox:
     """The functions above, in one value that travels to the workers and that a test can replace.
@@ -202,7 +162,6 @@ class Toolbox:
         make_policy: Name, environment and settings to a policy.
         make_planner: The planner of the nominal trajectories.
         load_metric: File or None to M(x).
-        certified_radius: Metric file, bound and times to radii, or None without certificate.
         make_filter: Policy, spacecraft environment and bound to the policy with the safety filter.
         position_margin: Policy and bound to the certified bound of its position error, or None.
     """
@@ -210,8 +169,5 @@ class Toolbox:
     make_policy: Callable[[str, Any, Mapping[str, Any]], Policy] = make_policy
     make_planner: Callable[[], Planner] = make_planner
     load_metric: Callable[[str | None], Callable[[FloatArray], FloatArray]] = load_metric
-    certified_radius: Callable[[str | None, float, FloatArray], FloatArray | None] = (
-        certified_radius
-    )
     make_filter: Callable[[Policy, Any, float], Policy] = make_filter
-    position_margin: Callable[[Policy, float], float | None] = position_margin
+    position_margin: Callable[[Any, float], float | None] = position_margin

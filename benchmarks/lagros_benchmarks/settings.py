@@ -130,8 +130,7 @@ class BenchmarkSettings:
         disturbances: Kinds of disturbance.
         bounds: d_bar, in units of the state per second; every kind meets every bound.
         channels: Disturbed states, "all" or "rates".
-        metric: File of the contraction metric for the kind "worst" and for the certified tube;
-            None takes the shipped one.
+        metric: File of the contraction metric for the kind "worst"; None takes the shipped one.
         preset: Preset of the spacecraft's scenarios; None for the cart-pole, as the next two.
         agents: Numbers of spacecraft in a world; several compare them.
         safety_filter: "none", "all" policies wear the filter, or "both" one after the other.

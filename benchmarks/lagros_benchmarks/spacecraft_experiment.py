@@ -17,7 +17,6 @@ from lagros_benchmarks.spacecraft_episodes import (
     Trace,
     WorldRecord,
     act,
-    bare,
     fly,
     fly_chunk,
     is_global,
@@ -182,7 +181,7 @@ class SpacecraftExperiment:
         )
 
     def _margin(self, policy: Policy, case: Case) -> float | None:
-        return self.toolbox.position_margin(bare(policy), case.condition.bound)
+        return self.toolbox.position_margin(policy, case.condition.bound)
 
 
 def fly_scene(settings: BenchmarkSettings, world: int, toolbox: Toolbox) -> Scene:

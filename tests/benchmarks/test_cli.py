@@ -31,7 +31,7 @@ def faked(monkeypatch):
     def make(name, env, settings):
         return fakes.make_policy(makers[name], env, settings)
 
-    toolbox = library.Toolbox(make, fakes.easy_planner, fakes.load_metric, fakes.certified_radius)
+    toolbox = library.Toolbox(make, fakes.easy_planner, fakes.load_metric)
     monkeypatch.setattr("lagros_benchmarks.runner.Toolbox", lambda: toolbox)
 
 
@@ -116,7 +116,7 @@ def test_missing_weights_end_with_status_1_and_a_sentence(invoke, faked, monkeyp
     def absent(name, env, settings):
         raise FileNotFoundError("no weights")
 
-    toolbox = library.Toolbox(absent, fakes.easy_planner, fakes.load_metric, fakes.certified_radius)
+    toolbox = library.Toolbox(absent, fakes.easy_planner, fakes.load_metric)
     monkeypatch.setattr("lagros_benchmarks.runner.Toolbox", lambda: toolbox)
     result = invoke("bench", "cartpole")
     assert result.exit_code == 1

@@ -108,7 +108,7 @@ def test_the_hint_is_found_behind_the_error_that_it_caused(monkeypatch, tmp_path
     def absent(name, env, settings):
         raise ModuleNotFoundError("No module named 'clarabel'", name="clarabel")
 
-    toolbox = library.Toolbox(absent, fakes.easy_planner, fakes.load_metric, fakes.certified_radius)
+    toolbox = library.Toolbox(absent, fakes.easy_planner, fakes.load_metric)
     monkeypatch.setattr("lagros_benchmarks.runner.Toolbox", lambda: toolbox)
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(cli.app, ["bench", "cartpole"])

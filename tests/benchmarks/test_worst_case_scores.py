@@ -28,7 +28,6 @@ from lagros_policies.baselines import LqrPolicy
 from lagros_policies.contraction import certified_tube
 from lagros_policies.contraction.lagrangian import SlidingAxis, SlidingTracking, peak_position_error
 from lagros_policies.expert import CartPoleExpert
-from lagros_policies.options import NeuralTubeMpcPolicy
 from lagros_policies.safety import SafetyFilter
 
 FloatArray = NDArray[np.float64]
@@ -153,16 +152,15 @@ def test_a_search_for_the_share_of_the_certificate_is_no_worse_than_its_starts(
         assert check.hold(np.array([index]), again).certified_share[0] == one.score
 
 
-def test_a_metric_that_is_a_network_is_attacked_by_the_tube_of_its_own() -> None:
+def test_a_metric_that_is_a_network_is_attacked_by_the_law_of_its_own() -> None:
     name = "lagros_policies.options:NeuralTubeMpcPolicy"
     given = AttackSettings(policy=name, bound=0.3, episodes=1, search=SearchSettings(budget=30))
     row = run_attack(given).row
-    metric = NeuralTubeMpcPolicy().expert.metric
     assert row["broken_rate"] == 1.0
     assert row["random_broken_rate"] == 0.0
-    steady = certified_tube(metric, 0.3).steady_radius
-    assert row["certified_radius_max"] == pytest.approx(steady, rel=1e-3)
-    assert not row["certified_crossed_rate"]
+    # Against the u* of the shipped metric it would err by newtons.
+    assert row["learning_error_max"] < 1e-3
+    assert row["certified_radius"] is None
 
 
 # Rows.

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401  (registers the environments)
-from lagros_benchmarks.library import make_filter, make_single_policy, position_margin
+from lagros_benchmarks.claims import position_margin
+from lagros_benchmarks.library import make_filter, make_single_policy
 from lagros_benchmarks.metrics import wilson_interval
 from lagros_benchmarks.settings import check_policy, check_task
 from lagros_benchmarks.spacecraft_episodes import bare
@@ -227,7 +228,7 @@ class _CartPoleBench:
             goal = self.settings.goal
             outcome, flight = replay_cartpole(self.episodes, index, self.policy, goal, one)
             if flight is not None:
-                more = self.certificate.hold(np.array([index]), flight).one(0)
+                more = self.certificate.hold(np.array([index]), flight).observed(0)
                 outcome = Outcome(
                     outcome.seed, outcome.score, outcome.broken, {**outcome.measures, **more}
                 )
@@ -265,10 +266,9 @@ def _targets(settings: AttackSettings) -> list[SpacecraftTarget]:
         settings.agents, settings.agents, settings.preset, "none", settings.bound
     )
     policy = make_single_policy(settings.policy, env)
-    margin = position_margin(policy, settings.bound)
     if settings.safety_filter:
-        # What the filter changes is not u*.
-        policy, margin = make_filter(policy, env, settings.bound), None
+        policy = make_filter(policy, env, settings.bound)
+    margin = position_margin(policy, settings.bound)
     return [
         SpacecraftTarget(
             policy,

@@ -38,9 +38,12 @@ class Held:
     certified_crossed: BoolArray
     certified_radius: FloatArray
 
-    def one(self, index: int) -> dict[str, float | bool]:
-        """Return the figures of one flight."""
-        return {name: value[index].item() for name, value in vars(self).items()}
+    def observed(self, index: int) -> dict[str, float | bool | None]:
+        """Return the figures of one flight; what is called certified is None (see `claims`)."""
+        return {
+            name: None if name.startswith("certified") else value[index].item()
+            for name, value in vars(self).items()
+        }
 
 
 class TubeCheck:
