@@ -26,7 +26,7 @@ def test_attack_writes_its_figures_and_flies_them_again(tmp_path: Path) -> None:
     assert "goal clearance, bound 0.3" in done.output
     row = json.loads(figures.read_text())
     left = sum(not one["measures"]["in_region"] for one in row["outcomes"])
-    assert f"which {left} of 2 flights left" in done.output
+    assert f"{left} of 2 flights left the region of the metric" in done.output
     assert (row["task"], row["policy"], row["bound"]) == ("cartpole", "lqr", 0.3)
     assert len(row["outcomes"]) == len(row["random_outcomes"]) == 2
     assert row["score_worst"] == max(one["score"] for one in row["outcomes"])
@@ -35,8 +35,17 @@ def test_attack_writes_its_figures_and_flies_them_again(tmp_path: Path) -> None:
     assert again.exit_code == 0, again.output
     assert again.output.count("as stored") == 2
 
-    # A figure that the sequence does not give is found out.
     cases = load_worst_cases(sequences)
+    assert cases.outcomes[0].measures["certified_radius"] is None
+    # Files of earlier versions hold what is claimed no longer; it is not compared.
+    claiming = [
+        replace(one, measures={**one.measures, "certified_radius": 9.0}) for one in cases.outcomes
+    ]
+    save_worst_cases(replace(cases, outcomes=tuple(claiming)), sequences)
+    older = RUNNER.invoke(app, ["attack", "cartpole", "--replay", str(sequences)])
+    assert older.exit_code == 0, older.output
+
+    # A figure that the sequence does not give is found out.
     first = replace(cases.outcomes[0], score=cases.outcomes[0].score + 1e-12)
     save_worst_cases(replace(cases, outcomes=(first, *cases.outcomes[1:])), sequences)
     wrong = RUNNER.invoke(app, ["attack", "cartpole", "--replay", str(sequences)])

@@ -198,9 +198,25 @@ def load_worst_cases(path: Path | str) -> WorstCases:
         record = json.loads(text)
         if record["format"] != _FORMAT:
             raise ValueError(f"format {record['format']!r} is not {_FORMAT!r}")
-        outcomes = tuple(Outcome(**entry) for entry in record["outcomes"])
+        outcomes = tuple(_outcome(entry) for entry in record["outcomes"])
         if pushes.ndim not in (3, 4) or len(pushes) != len(outcomes):
             raise ValueError(f"{len(outcomes)} outcomes do not match pushes {pushes.shape}")
         return WorstCases(record["command"], pushes, outcomes)
-    except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (
+        AttributeError,
+        KeyError,
+        TypeError,
+        ValueError,
+        EOFError,
+        zipfile.BadZipFile,
+    ) as error:
         raise ValueError(f"{path} is not a file of `lagros attack --npz`: {error}") from error
+
+
+def _outcome(entry: Mapping[str, Any]) -> Outcome:
+    """Return a stored outcome without what files of earlier versions called certified."""
+    measures = {
+        name: None if name.startswith("certified") else value
+        for name, value in entry["measures"].items()
+    }
+    return Outcome(**{**entry, "measures": measures})
