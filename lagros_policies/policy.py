@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_policies.wrappers import bare_environment
 
 Float32Array = NDArray[np.float32]
 # What a planner remembers between calls; stateless policies keep None.
@@ -92,8 +93,11 @@ def row_memories(
     return [None if start else memory for memory, start in zip(memories, starts, strict=True)]
 
 
-def make(name: str, env: Any, **settings: Any) -> Policy:
+def make(name: str, env: Any, allow_wrappers: bool = False, **settings: Any) -> Policy:
     """Build a policy for an environment.
+
+    A policy speaks the environment's own observations and actions, so that one within wrappers that
+    may change their meaning is refused; those that record, limit or render are looked through.
 
     Args:
         name: One of `NAMES` (`SPACECRAFT_NAMES` for the spacecraft); the path of a
@@ -101,35 +105,37 @@ def make(name: str, env: Any, **settings: Any) -> Policy:
             own that is built with the task's settings (and, where its attribute `prepared` is True,
             with the bound of the disturbance as `disturbance_bound`). A zip of stable-baselines3
             holds pickled code and a module is code: both run, so name only what you trust.
-        env: A Gymnasium or PettingZoo environment of this package; the policy takes its task
-            settings (and preset, and the bound of its disturbance) and nothing else.
+        env: A Gymnasium or PettingZoo environment of this package, several in a vector, or the id
+            of one; the policy takes its task settings (and preset, and the bound of its
+            disturbance) and nothing else.
+        allow_wrappers: Look through every wrapper, as one of your own that changes neither.
         settings: Passed to the policy, e.g. `weights=path` or `metric=...`.
 
     Returns:
         The policy.
 
     Raises:
-        ValueError: The name is unknown.
+        ValueError: The name or the id is unknown, or a wrapper may change what an observation or
+            an action means.
         TypeError: The environment is not one of this package.
         ImportError: A package that the policy needs is not installed.
     """
-    task = getattr(env.unwrapped, "settings", None)
+    world = bare_environment(env, allow_wrappers)
+    task: CartPoleSettings | SpacecraftSettings = world.settings
     if isinstance(task, SpacecraftSettings):
         classes = _SPACECRAFT
-        settings = {"preset": env.unwrapped.preset, **settings}
-    elif isinstance(task, CartPoleSettings):
-        classes = _CARTPOLE
+        settings = {"preset": world.preset, **settings}
     else:
-        raise TypeError(f"there are no policies for {env}; use an environment of lagros_envs")
+        classes = _CARTPOLE
     if name in classes:
-        return _built(_shipped_class(name, classes[name]), task, env, settings)
+        return _built(_shipped_class(name, classes[name]), task, world, settings)
     if name.endswith(".zip"):
         from lagros_policies.sb3_model import load_stable_baselines3
 
         algorithm, _, path = name.rpartition(":")
         return load_stable_baselines3(path, algorithm or None, **settings)
     if ":" in name:
-        return _built(_class_named(name), task, env, settings)
+        return _built(_class_named(name), task, world, settings)
     near = difflib.get_close_matches(name, classes, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     raise ValueError(
@@ -138,9 +144,11 @@ def make(name: str, env: Any, **settings: Any) -> Policy:
     )
 
 
-def _built(policy: Callable[..., Policy], task: Any, env: Any, settings: dict[str, Any]) -> Policy:
+def _built(
+    policy: Callable[..., Policy], task: Any, world: Any, settings: dict[str, Any]
+) -> Policy:
     if getattr(policy, "prepared", False):
-        settings = {"disturbance_bound": env.unwrapped.disturbance.bound, **settings}
+        settings = {"disturbance_bound": world.disturbance.bound, **settings}
     return policy(task, **settings)
 
 
