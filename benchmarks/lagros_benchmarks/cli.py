@@ -16,6 +16,7 @@ from lagros_benchmarks.certify import certify
 from lagros_benchmarks.data import data
 from lagros_benchmarks.export import export
 from lagros_benchmarks.terminal import (
+    Commands,
     fail,
     find_users_modules,
     listed,
@@ -38,6 +39,7 @@ DEMO_FOLDER = Path("runs/demo")
 DEMO: dict[str, Any] = {"episodes": 50, "disturbances": ("uniform",), "bounds": (0.75,)}
 
 app = typer.Typer(
+    cls=Commands,
     help="Learning-based robust motion planning with guaranteed stability.",
     no_args_is_help=True,
     add_completion=False,

@@ -1,6 +1,6 @@
 """What the commands say on the terminal: errors without a traceback, lists, progress.
 
-Only the standard library, typer and `extras` are imported here.
+Only the standard library, typer, `extras` and `streams` are imported here.
 """
 
 from __future__ import annotations
@@ -12,13 +12,17 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import typer
+from typer.core import TyperGroup
 
 from lagros_benchmarks.extras import install_hint
+from lagros_benchmarks.streams import patient_streams
 
 if TYPE_CHECKING:
     from lagros_benchmarks.workers import Progress
 
 USAGE_ERROR = 2
+# What a shell gives a process that Ctrl-C has ended: 128 and the number of the signal.
+INTERRUPTED = 130
 
 Value = TypeVar("Value")
 
@@ -30,6 +34,26 @@ def fail(error: Exception | str, status: int = USAGE_ERROR) -> NoReturn:
         text += install_hint(error)
     typer.echo(f"lagros: {text}", err=True)
     raise typer.Exit(status)
+
+
+class Commands(TyperGroup):
+    """All commands: what happens to any of them, and is no mistake of the program, in one line."""
+
+    def main(self, *args: Any, **options: Any) -> Any:
+        """Run a command; see `patient_streams` for what it prints."""
+        with patient_streams():
+            return super().main(*args, **options)
+
+    def invoke(self, context: Any) -> Any:
+        """Run a command; a disk that is full, a Ctrl-C or too little memory end it with a line."""
+        try:
+            return super().invoke(context)
+        except KeyboardInterrupt:
+            fail("interrupted", status=INTERRUPTED)
+        except MemoryError:
+            fail("the memory is too small for what was asked for", status=1)
+        except OSError as error:
+            fail(error, status=1)
 
 
 def find_users_modules() -> None:

@@ -1,0 +1,132 @@
+"""The files of a command: refused before the work or written after it, each on its own.
+
+Only the standard library, typer and `lagros_envs.files` are imported here.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from lagros_envs.files import Writable, check_writable, remove_folders, write_atomic
+
+# What a command asks for or reads, by the option that names it; None where it is left out.
+Paths = Mapping[str, Path | None]
+
+
+def check_outputs(outputs: Paths, inputs: Paths | None = None) -> None:
+    """Check by trying that all files of a command can be written, and make their folders.
+
+    Args:
+        outputs: What the command writes.
+        inputs: What it reads, and must not write over.
+
+    Raises:
+        ValueError: One cannot be written, two are one file, or one is what the command reads.
+    """
+    seen: dict[object, str] = {}
+    for option, path in (inputs or {}).items():
+        if path is not None and path.is_file():
+            status = path.stat()
+            seen[status.st_dev, status.st_ino] = f"what {option} reads"
+    made: tuple[Path, ...] = ()
+    for option, path in outputs.items():
+        if path is None:
+            continue
+        try:
+            found = _writable(option, path)
+            made += found.made
+            if found.place in seen:
+                raise ValueError(
+                    f"{option}: {str(path)!r} is {seen[found.place]}, too; name another file"
+                )
+        except ValueError:
+            remove_folders(made)
+            raise
+        if found.place is not None:
+            seen[found.place] = f"the file of {option}"
+
+
+def _writable(option: str, path: Path) -> Writable:
+    try:
+        return check_writable(path)
+    except OSError as error:
+        raise ValueError(
+            f"{option}: cannot write {str(path)!r}: {error.strerror}; name another file"
+        ) from error
+
+
+class Delivery:
+    """Writes the files of a command, so that one that fails takes no other with it.
+
+    What cannot be written where it was asked for is kept in a temporary folder, and where that
+    fails, too, its text is printed. Write all files first, and only then `tell`.
+    """
+
+    def __init__(self) -> None:
+        """Begin with nothing written."""
+        self.written: list[Path] = []
+        self.problems: list[str] = []
+        self._texts: list[str] = []
+
+    def write(
+        self,
+        path: Path | None,
+        write: Callable[[Path], Any],
+        text: Callable[[], str] | None = None,
+    ) -> None:
+        """Write one file.
+
+        Args:
+            path: Where to; None leaves it out.
+            write: Takes a path and writes the file.
+            text: Returns what to print if there is no place left; None for what is no text.
+        """
+        if path is None:
+            return
+        try:
+            write(path)
+        except OSError as error:
+            kept = self._keep(path, write, text)
+            self.problems.append(f"cannot write {str(path)!r}: {error.strerror or error}; {kept}")
+        except Exception as error:
+            # A figure that cannot be drawn, for instance, is not the business of the other files.
+            self.problems.append(f"cannot make {str(path)!r}: {error}")
+        else:
+            self.written.append(path)
+
+    def write_text(self, path: Path | None, text: Callable[[], str]) -> None:
+        """Write one file of text; see `write`."""
+        self.write(path, lambda place: write_atomic(place, text()), text)
+
+    def tell(self) -> None:
+        """Say what was written and what was not.
+
+        Raises:
+            typer.Exit: With status 1, if a file was not written where it was asked for.
+        """
+        for text in self._texts:
+            typer.echo(text)
+        for path in self.written:
+            typer.echo(f"wrote {path}")
+        for problem in self.problems:
+            typer.echo(f"lagros: {problem}", err=True)
+        if self.problems:
+            raise typer.Exit(1)
+
+    def _keep(
+        self, path: Path, write: Callable[[Path], Any], text: Callable[[], str] | None
+    ) -> str:
+        try:
+            kept = Path(tempfile.mkdtemp(prefix="lagros-")) / path.name
+            write(kept)
+        except OSError:
+            if text is None:
+                return "there is no room in the temporary folder either"
+            self._texts.append(text())
+            return "it is printed instead"
+        return f"it is kept as {kept}"
