@@ -4,18 +4,20 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.lagros-installed
+DEMO_STAMP := $(VENV)/.lagros-demo-installed
 SPEED_STAMP := $(VENV)/.lagros-speed-installed
 
 # Two test workers, each with one thread: more threads than cores make small matrix products slow.
 # No test opens a window.
 PYTEST := OMP_NUM_THREADS=1 MPLBACKEND=Agg SDL_VIDEODRIVER=dummy $(BIN)/python -m pytest -n 2
+PIP := $(BIN)/python -m pip install -c constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo test test-slow lint format speed clean
+.PHONY: help install demo test test-slow test-other-cpu lint format speed clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 install: $(STAMP) ## create .venv and install lagros with all extras, in the pinned versions
 
@@ -27,15 +29,20 @@ $(BIN)/python:
 # The interpreter is an order-only prerequisite: its date says nothing about what is installed.
 # torch goes first, so that its build is settled before the packages that depend on it.
 $(STAMP): pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/python -m pip install -c constraints.txt torch
-	$(BIN)/python -m pip install -c constraints.txt -e ".[all]"
+	$(PIP) torch
+	$(PIP) -e ".[all]"
+	@touch $@ $(DEMO_STAMP)
+
+# What the demo runs and no more: no torch, no linters, no clusters. `make install` adds the rest.
+$(DEMO_STAMP): pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) -e ".[bench]"
 	@touch $@
 
 $(SPEED_STAMP): $(STAMP)
-	$(BIN)/python -m pip install -c constraints.txt -e ".[speed]"
+	$(PIP) -e ".[speed]"
 	@touch $@
 
-demo: install ## a short tour: one command, no settings
+demo: $(DEMO_STAMP) ## a short tour: one command, no settings
 	$(BIN)/lagros demo
 
 test: lint ## lint, then the tests that are not marked slow
@@ -43,6 +50,9 @@ test: lint ## lint, then the tests that are not marked slow
 
 test-slow: install ## the tests that are marked slow
 	$(PYTEST) -m slow
+
+test-other-cpu: install ## those tests again, as a processor of another make would run them
+	settings=$$($(BIN)/python tests/other_cpu.py) && env $$settings $(PYTEST) -m "not slow"
 
 lint: install ## ruff and mypy
 	$(BIN)/ruff check .
