@@ -1,6 +1,6 @@
 """PPO in one file, in the style of CleanRL, on the vector form of `lagros/CartPole-v0`.
 
-    pip install "lagros[policies]"
+    pip install "lagros[train]"
     python examples/cleanrl_ppo_cartpole.py --updates 60
 
 Nothing but Gymnasium and torch is between the loop below and the environment. Every update plays

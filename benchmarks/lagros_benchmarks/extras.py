@@ -5,18 +5,20 @@ Only the standard library is imported here: it must work where nothing else is i
 
 from __future__ import annotations
 
-# The packages of each extra that the command line may ask for, by the name of their import.
+# The packages of each extra that the command line may ask for, by the name of their import. Of two
+# extras that hold one package, the first is named: the command line is there already.
 MODULES = {
-    "policies": ("clarabel", "cvxpy", "joblib", "piqp", "safetensors", "scipy", "torch"),
+    "policies": ("clarabel", "piqp", "safetensors", "scipy"),
+    "bench": ("PIL", "joblib", "matplotlib", "rich", "typer"),
+    "train": ("cvxpy", "joblib", "torch"),
     "rl": ("stable_baselines3", "tensorboard"),
-    "bench": ("matplotlib", "rich", "typer"),
     "render": ("pygame",),
     "video": ("imageio_ffmpeg",),
     "data": ("PIL", "minari", "pyarrow"),
     "onnx": ("onnxruntime",),
     "attack": ("cmaes",),
     "ray": ("ray",),
-    "dask": ("distributed",),
+    "dask": ("distributed", "joblib"),
     "fast": ("numba",),
 }
 

@@ -129,7 +129,7 @@ def _train_one(
         import stable_baselines3  # noqa: F401
     except ImportError as error:
         raise ImportError(
-            "lagros train needs stable-baselines3: pip install 'lagros[rl,policies]'"
+            "lagros train needs stable-baselines3: pip install 'lagros[rl]'"
         ) from error
     import torch
     from rich.console import Console

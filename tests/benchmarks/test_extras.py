@@ -27,7 +27,7 @@ IMPORTS = {
 # What each package may import: required, and the extras that its functions ask for.
 ALLOWED = {
     "lagros_envs": ("fast", "render"),
-    "lagros_policies": ("policies", "rl", "onnx", "ray", "dask"),
+    "lagros_policies": ("policies", "train", "rl", "onnx", "ray", "dask"),
     "benchmarks/lagros_benchmarks": tuple(MODULES),
 }
 

@@ -1,0 +1,94 @@
+"""What the pages tell a reader to type and to run. Needs nothing but the standard library."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from typing import NamedTuple
+
+# The words that a line to type begins with.
+PROGRAMS = ("lagros", "python", "python3", "pip", "make", "source", "git")
+_ASSIGNMENT = re.compile(r"[A-Z][A-Z0-9_]*=\S*")
+
+
+class Command(NamedTuple):
+    """A command of a page.
+
+    Attributes:
+        line: Number of its first line, from 1.
+        words: As a shell takes it apart, variables in front and a comment behind left out.
+    """
+
+    line: int
+    words: tuple[str, ...]
+
+
+def python_blocks(text: str) -> list[str]:
+    """Return the fenced blocks of Python of a page."""
+    return re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+def commands(text: str) -> list[Command]:
+    """Return the commands of a page, from its fenced and its indented blocks.
+
+    Raises:
+        ValueError: A line of such a block is no command: the one before it lacks its backslash.
+    """
+    found: list[Command] = []
+    for block in _blocks(text):
+        first = next((line for _, line in block if line.strip()), "")
+        if not _is_command(first):
+            continue
+        lines = iter(block)
+        for number, line in lines:
+            whole = line
+            while whole.rstrip().endswith("\\"):
+                whole = whole.rstrip()[:-1] + next(lines, (0, ""))[1]
+            if not whole.strip() or whole.lstrip().startswith("#"):
+                continue
+            if not _is_command(whole):
+                raise ValueError(f"line {number} is no command: {whole.strip()!r}")
+            words = shlex.split(whole, comments=True)
+            while _ASSIGNMENT.fullmatch(words[0]):
+                words.pop(0)
+            # "a && b" are two.
+            while "&&" in words:
+                cut = words.index("&&")
+                found.append(Command(number, tuple(words[:cut])))
+                words = words[cut + 1 :]
+            found.append(Command(number, tuple(words)))
+    return found
+
+
+def _is_command(line: str) -> bool:
+    words = line.split()
+    while words and _ASSIGNMENT.fullmatch(words[0]):
+        words.pop(0)
+    return bool(words) and words[0].rpartition("/")[2] in PROGRAMS
+
+
+def _blocks(text: str) -> list[list[tuple[int, str]]]:
+    """Return the blocks of code of a page, as numbered lines."""
+    blocks: list[list[tuple[int, str]]] = []
+    fenced, before = "", "blank"
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.lstrip().startswith("```"):
+            fenced = "" if fenced else line.strip("` \n") or "text"
+            before = "fence"
+            blocks.append([])
+        elif fenced:
+            # A paragraph at a time: a block may go on in another language.
+            if not line.strip():
+                blocks.append([])
+            elif fenced in ("console", "bash", "sh", "shell"):
+                blocks[-1].append((number, line))
+        elif not line.strip():
+            before = "blank"
+        elif line.startswith("    ") and before in ("blank", "code"):
+            if before != "code":
+                blocks.append([])
+            blocks[-1].append((number, line))
+            before = "code"
+        else:
+            before = "text"
+    return [block for block in blocks if block]
