@@ -129,7 +129,8 @@ def test_a_command_that_cannot_be_typed_is_found(text, complaint):
 
 
 def test_commands_are_taken_apart_as_a_shell_does():
-    text = 'Prose.\n\n    A=1 lagros bench x \\\n        --json "a b"  # why\n\n    make && make test\n'
+    long = '    A=1 lagros bench x \\\n        --json "a b"  # why\n'
+    text = f"Prose.\n\n{long}\n    make && make test\n"
     assert documents.commands(text) == [
         (3, ("lagros", "bench", "x", "--json", "a b")),
         (6, ("make",)),
