@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lagros_benchmarks.outputs import Delivery, check_outputs, policy_files
 from lagros_benchmarks.terminal import fail, find_users_modules
 
 if TYPE_CHECKING:
@@ -88,6 +89,7 @@ def attack(
             from dataclasses import replace
 
             settings = replace(settings, safety_filter=True)
+        check_outputs({"--json": json, "--npz": npz}, policy_files([policy]))
         _search(settings, json, npz)
     except FileNotFoundError as error:
         fail(f"there is no file {error.filename}; --npz of an earlier attack writes one")
@@ -130,19 +132,18 @@ def _settings(
 
 
 def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> None:
-    from lagros_benchmarks.files import write_json
+    from lagros_benchmarks.files import json_text
     from lagros_benchmarks.worst_case.attack import run_attack
     from lagros_benchmarks.worst_case.replay import save_worst_cases
 
     found = run_attack(settings, lambda text: typer.echo(text, err=True))
+    delivery = Delivery()
+    record = {"command": " ".join(["lagros", *sys.argv[1:]]), **found.row}
+    delivery.write_text(json, lambda: json_text(record))
+    delivery.write(npz, lambda path: save_worst_cases(found.cases, path))
     for line in summary(found.row):
         typer.echo(line)
-    if json is not None:
-        write_json(json, {"command": " ".join(["lagros", *sys.argv[1:]]), **found.row})
-        typer.echo(f"wrote {json}")
-    if npz is not None:
-        save_worst_cases(found.cases, npz)
-        typer.echo(f"wrote {npz}")
+    delivery.tell()
 
 
 def _replay(task: str, path: Path) -> None:

@@ -6,6 +6,7 @@ direct labels tell the policies apart in greyscale.
 
 from __future__ import annotations
 
+import importlib.util
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -71,7 +72,10 @@ def check_figure_path(path: str | Path) -> Path:
 
     Raises:
         ValueError: Its suffix names no format that can be drawn.
+        ModuleNotFoundError: Matplotlib is not installed.
     """
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ModuleNotFoundError("a figure needs Matplotlib", name="matplotlib")
     if Path(path).suffix.lower() not in FORMATS:
         raise ValueError(f"figure {str(path)!r} must end in {', '.join(FORMATS)}")
     return Path(path)

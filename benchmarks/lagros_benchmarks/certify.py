@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lagros_benchmarks.outputs import Delivery, check_outputs
 from lagros_benchmarks.terminal import fail
 
 if TYPE_CHECKING:
@@ -61,7 +62,6 @@ def certify(
     Ends with status 1 if anything that it claims does not hold.
     """
     from lagros_benchmarks.settings import check_task
-    from lagros_envs.files import write_atomic
 
     try:
         check_task(task)
@@ -78,6 +78,7 @@ def certify(
             raise ValueError(f"--seconds: {seconds!r} must be positive")
         if largest and task != "cartpole":
             raise ValueError("--largest: the spacecraft's proof is for all states already")
+        check_outputs({"--json": json}, {"--metric": metric})
     except ValueError as error:
         fail(error)
     level = BOUNDS[task] if bound is None else bound
@@ -91,13 +92,12 @@ def certify(
     except (ValueError, OSError, RuntimeError) as error:
         # A metric that cannot be read, or is none, is a certificate that cannot be given.
         fail(error, status=1)
+    delivery = Delivery()
+    delivery.write_text(
+        json, lambda: json_module.dumps(found.as_json(), indent=1, allow_nan=False) + "\n"
+    )
     print_certificate(found)
-    if json is not None:
-        try:
-            write_atomic(json, json_module.dumps(found.as_json(), indent=1, allow_nan=False) + "\n")
-        except OSError as error:
-            fail(f"cannot write {json}: {error}")
-        typer.echo(f"wrote {json}")
+    delivery.tell()
     if not found.holds:
         raise typer.Exit(1)
 

@@ -15,6 +15,7 @@ from lagros_benchmarks.attack import attack
 from lagros_benchmarks.certify import certify
 from lagros_benchmarks.data import data
 from lagros_benchmarks.export import export
+from lagros_benchmarks.outputs import policy_files
 from lagros_benchmarks.terminal import (
     Commands,
     fail,
@@ -174,7 +175,7 @@ def bench(
         )
         for name in settings.policies:
             check_policy(name, task)
-        outputs.check(task, settings.episodes)
+        outputs.check(task, settings.episodes, policy_files(settings.policies))
     except ValueError as error:
         fail(error)
     run_and_report(settings, outputs)
@@ -187,6 +188,10 @@ def demo() -> None:
     from lagros_benchmarks.settings import BenchmarkSettings
 
     outputs = Outputs(json=DEMO_FOLDER / "results.json", figure=DEMO_FOLDER / "error.png")
+    try:
+        outputs.check()
+    except ValueError as error:
+        fail(error)
     run_and_report(BenchmarkSettings(**DEMO), outputs)
 
 
@@ -221,8 +226,10 @@ def reproduce(
     try:
         check_task(task)
         workers = Backend(backend, address)
+        wanted = _reproduction(task, episodes, jobs, workers)
+        outputs = _reproduced(task, place)
+        outputs.check(task)
         with progress_bar() as progress, running(workers, jobs):
-            wanted = _reproduction(task, episodes, jobs, workers)
             benchmark = (
                 wanted.benchmark(None)
                 if shipped
@@ -232,7 +239,7 @@ def reproduce(
         fail(error)
     except BackendError as error:
         fail(error, status=1)
-    run_and_report(benchmark, _reproduced(task, place))
+    run_and_report(benchmark, outputs)
 
 
 def _reproduction(task: str, episodes: int | None, jobs: int, backend: Backend) -> Reproduction:
@@ -267,7 +274,7 @@ app.add_typer(data, name="data")
 
 
 def run_and_report(settings: BenchmarkSettings, outputs: Outputs) -> list[Row]:
-    """Run a benchmark with a progress bar, print its table and write its files.
+    """Run a benchmark with a progress bar, write its files and print its table.
 
     Args:
         settings: What to run.
@@ -289,7 +296,7 @@ def run_and_report(settings: BenchmarkSettings, outputs: Outputs) -> list[Row]:
         # No weights, damaged weights, an extra that is not installed, a cluster that is not there.
         fail(error, status=1)
     rows = summarise(run)
+    delivery = outputs.write(run, rows)
     print_report(rows)
-    for path in outputs.write(run, rows):
-        typer.echo(f"wrote {path}")
+    delivery.tell()
     return rows

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from lagros_benchmarks.outputs import Delivery, check_outputs
 from lagros_benchmarks.terminal import fail
 
 if TYPE_CHECKING:
@@ -78,8 +79,10 @@ def export(
         fail("--preset and --agents are for the spacecraft; leave them out for the cart-pole")
     if policy in SPACECRAFT_NAMES and tanh is not None:
         fail("--tanh is for the cart-pole; the spacecraft's network has no tanh: leave it out")
+    path = out or Path(f"{policy.replace('-', '_')}.{format_}")
     try:
         source = load_source(policy, weights, preset or "paper", agents)
+        check_outputs({"--out": path}, {"--weights": weights})
     except (ValueError, OSError) as error:
         fail(error)
     try:
@@ -93,15 +96,16 @@ def export(
     else:
         # A NaN lands here too.
         fail(f"not written: the export and NumPy differ by {found}", status=1)
-    path = out or Path(f"{policy.replace('-', '_')}.{format_}")
-    try:
-        write_atomic(path, data)
-    except OSError as error:
-        fail(f"cannot write {path}: {error}")
+    delivery = Delivery()
+    delivery.write(
+        path,
+        lambda place: write_atomic(place, data),
+        (lambda: data) if isinstance(data, str) else None,
+    )
     typer.echo(f"weights {source.file}, SHA-256 {source.digest}")
     for told in (line, *cost):
         typer.echo(told)
-    typer.echo(f"wrote {path} ({path.stat().st_size / 1e3:.0f} kB)")
+    delivery.tell(f"{len(data) / 1e3:.0f} kB")
 
 
 def _written(

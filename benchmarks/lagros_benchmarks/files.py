@@ -12,7 +12,7 @@ import numpy as np
 
 from lagros_envs.files import write_atomic
 
-__all__ = ["plain", "write_atomic", "write_json", "write_json_lines"]
+__all__ = ["json_lines_text", "json_text", "plain", "write_atomic", "write_json"]
 
 
 def plain(value: Any) -> Any:
@@ -30,15 +30,19 @@ def plain(value: Any) -> Any:
     return value
 
 
+def json_text(value: Any) -> str:
+    """Return a value as indented JSON, lists of numbers on one line each."""
+    return _pretty(plain(value)) + "\n"
+
+
+def json_lines_text(values: Iterable[Any]) -> str:
+    """Return one JSON object a line."""
+    return "".join(f"{json.dumps(plain(value), allow_nan=False)}\n" for value in values)
+
+
 def write_json(path: str | Path, value: Any) -> Path:
-    """Write a value as indented JSON, lists of numbers on one line each."""
-    return write_atomic(path, _pretty(plain(value)) + "\n")
-
-
-def write_json_lines(path: str | Path, values: Iterable[Any]) -> Path:
-    """Write one JSON object a line."""
-    lines = (json.dumps(plain(value), allow_nan=False) for value in values)
-    return write_atomic(path, "".join(f"{line}\n" for line in lines))
+    """Write a value as `json_text`."""
+    return write_atomic(path, json_text(value))
 
 
 def _pretty(value: Any, indent: str = "") -> str:

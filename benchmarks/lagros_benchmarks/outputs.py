@@ -1,18 +1,21 @@
 """The files of a command: refused before the work or written after it, each on its own.
 
-Only the standard library, typer and `lagros_envs.files` are imported here.
+Only the standard library, typer and `extras` are imported here.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from lagros_envs.files import Writable, check_writable, remove_folders, write_atomic
+from lagros_benchmarks.extras import install_hint
+
+if TYPE_CHECKING:
+    from lagros_envs.files import Writable
 
 # What a command asks for or reads, by the option that names it; None where it is left out.
 Paths = Mapping[str, Path | None]
@@ -28,6 +31,8 @@ def check_outputs(outputs: Paths, inputs: Paths | None = None) -> None:
     Raises:
         ValueError: One cannot be written, two are one file, or one is what the command reads.
     """
+    from lagros_envs.files import remove_folders
+
     seen: dict[object, str] = {}
     for option, path in (inputs or {}).items():
         if path is not None and path.is_file():
@@ -51,7 +56,15 @@ def check_outputs(outputs: Paths, inputs: Paths | None = None) -> None:
             seen[found.place] = f"the file of {option}"
 
 
+def policy_files(policies: Iterable[str]) -> dict[str, Path]:
+    """Return the policies that are files, which may be written algorithm:file, as inputs."""
+    paths = (Path(name.rpartition(":")[2]) for name in policies)
+    return {f"the policy {path}": path for path in paths if path.suffix == ".zip"}
+
+
 def _writable(option: str, path: Path) -> Writable:
+    from lagros_envs.files import check_writable
+
     try:
         return check_writable(path)
     except OSError as error:
@@ -95,16 +108,21 @@ class Delivery:
             self.problems.append(f"cannot write {str(path)!r}: {error.strerror or error}; {kept}")
         except Exception as error:
             # A figure that cannot be drawn, for instance, is not the business of the other files.
-            self.problems.append(f"cannot make {str(path)!r}: {error}")
+            self.problems.append(f"cannot make {str(path)!r}: {error}{install_hint(error)}")
         else:
             self.written.append(path)
 
     def write_text(self, path: Path | None, text: Callable[[], str]) -> None:
         """Write one file of text; see `write`."""
+        from lagros_envs.files import write_atomic
+
         self.write(path, lambda place: write_atomic(place, text()), text)
 
-    def tell(self) -> None:
+    def tell(self, note: str = "") -> None:
         """Say what was written and what was not.
+
+        Args:
+            note: What is worth knowing about the files that were written.
 
         Raises:
             typer.Exit: With status 1, if a file was not written where it was asked for.
@@ -112,7 +130,7 @@ class Delivery:
         for text in self._texts:
             typer.echo(text)
         for path in self.written:
-            typer.echo(f"wrote {path}")
+            typer.echo(f"wrote {path} ({note})" if note else f"wrote {path}")
         for problem in self.problems:
             typer.echo(f"lagros: {problem}", err=True)
         if self.problems:

@@ -15,7 +15,7 @@ import numpy as np
 import lagros_envs  # noqa: F401  (registers the environments)
 from lagros_benchmarks import library
 from lagros_benchmarks.settings import unknown_name
-from lagros_benchmarks.video import FRAME_RATES, Frame, check_video_path, write_video
+from lagros_benchmarks.video import FRAME_RATES, Frame, check_video_path, video_bytes
 from lagros_envs import spacecraft_v0
 from lagros_envs.checks import check_at_least, check_not_negative, check_positive, check_seed
 from lagros_envs.disturbances import KINDS
@@ -135,18 +135,19 @@ class Playback:
             "render_fps": max(1, round(self._rate)),
         }
 
-    def play(self) -> Path | None:
-        """Play the episode: write the video, or show it in the window until it is closed.
+    def play(self) -> bytes | None:
+        """Play the episode: film it, or show it in the window until it is closed.
 
         Returns:
-            The video, or None.
+            The content of the video, or None.
 
         Raises:
             ImportError: pygame is not installed.
             RuntimeError: No window can be opened here.
         """
         if self.settings.video is not None:
-            return write_video(self.settings.video, self._drawn(), self._rate)
+            kind = self.settings.video.suffix.lower()
+            return video_bytes(kind, self._drawn(), self._rate)
         self._show()
         return None
 

@@ -1,11 +1,13 @@
-"""What a run leaves behind: the printed tables, and the files that were asked for."""
+"""What a run leaves behind: the files that were asked for, and the printed tables."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from lagros_benchmarks.outputs import Delivery, Paths, check_outputs
 
 if TYPE_CHECKING:
     from lagros_benchmarks.experiment import BenchmarkRun, Row
@@ -36,16 +38,19 @@ class Outputs:
     scene: Path | None = None
     scene_world: int = 0
 
-    def check(self, task: str = "cartpole", episodes: int | None = None) -> None:
+    def check(
+        self, task: str = "cartpole", episodes: int | None = None, inputs: Paths | None = None
+    ) -> None:
         """Check the files before the run and not after it.
 
         Args:
             task: The task of the run.
             episodes: Its number of episodes; None leaves the scene's world unchecked.
+            inputs: Files that the run reads, by the option that names them.
 
         Raises:
-            ValueError: A folder cannot be made, a figure has an unknown suffix, or the task has no
-                such scene.
+            ValueError: A file cannot be written, two are one, a figure has an unknown suffix, or
+                the task has no such scene.
         """
         for path in (self.figure, self.scene):
             if path is not None:
@@ -60,36 +65,53 @@ class Outputs:
                     f"scene_world={self.scene_world!r} must be one of the run's worlds, 0 to "
                     f"{episodes - 1}"
                 )
-        files = (self.json, self.csv, self.latex, self.markdown, self.figure, self.episodes)
-        for path in (*files, self.scene):
-            if path is None:
-                continue
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise ValueError(f"cannot write {str(path)!r}: {error.strerror}") from error
+        check_outputs(self._paths, inputs)
 
-    def write(self, run: BenchmarkRun, rows: list[Row]) -> Iterator[Path]:
-        """Write the files, and yield the path of each."""
-        from lagros_benchmarks import figures, files, records, tables
+    @property
+    def some(self) -> bool:
+        """Whether a file is asked for."""
+        return any(path is not None for path in self._paths.values())
 
-        if self.json is not None:
-            yield files.write_json(self.json, rows)
-        if self.csv is not None:
-            yield files.write_atomic(self.csv, tables.csv_text(rows))
-        if self.latex is not None:
-            yield files.write_atomic(self.latex, tables.latex_text(rows))
-        if self.markdown is not None:
-            yield files.write_atomic(self.markdown, tables.markdown_text(rows))
-        if self.episodes is not None:
-            yield files.write_json_lines(self.episodes, records.episode_objects(run))
-        if self.figure is not None:
-            yield figures.draw(rows, self.figure)
-        if self.scene is not None:
-            from lagros_benchmarks.runner import fly_scene
-            from lagros_benchmarks.scene_figure import scene_figure
+    @property
+    def _paths(self) -> dict[str, Path | None]:
+        return {
+            "--json": self.json,
+            "--csv": self.csv,
+            "--latex": self.latex,
+            "--markdown": self.markdown,
+            "--episodes-file": self.episodes,
+            "--figure": self.figure,
+            "--scene": self.scene,
+        }
 
-            yield scene_figure(fly_scene(run.settings, self.scene_world), self.scene)
+    def write(self, run: BenchmarkRun, rows: list[Row]) -> Delivery:
+        """Write the files, each on its own, and return what came of it."""
+        from lagros_benchmarks import files, records, tables
+
+        delivery = Delivery()
+        delivery.write_text(self.json, lambda: files.json_text(rows))
+        delivery.write_text(self.csv, lambda: tables.csv_text(rows))
+        delivery.write_text(self.latex, lambda: tables.latex_text(rows))
+        delivery.write_text(self.markdown, lambda: tables.markdown_text(rows))
+        delivery.write_text(
+            self.episodes, lambda: files.json_lines_text(records.episode_objects(run))
+        )
+        delivery.write(self.figure, lambda path: _draw(rows, path))
+        delivery.write(self.scene, lambda path: _draw_scene(run, self.scene_world, path))
+        return delivery
+
+
+def _draw(rows: list[Row], path: Path) -> None:
+    from lagros_benchmarks.figures import draw
+
+    draw(rows, path)
+
+
+def _draw_scene(run: BenchmarkRun, world: int, path: Path) -> None:
+    from lagros_benchmarks.runner import fly_scene
+    from lagros_benchmarks.scene_figure import scene_figure
+
+    scene_figure(fly_scene(run.settings, world), path)
 
 
 def print_report(rows: Sequence[Row]) -> None:

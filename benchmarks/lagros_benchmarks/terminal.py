@@ -45,11 +45,15 @@ class Commands(TyperGroup):
             return super().main(*args, **options)
 
     def invoke(self, context: Any) -> Any:
-        """Run a command; a disk that is full, a Ctrl-C or too little memory end it with a line."""
+        """Run a command; a full disk, a Ctrl-C, a missing package end it with one line."""
         try:
             return super().invoke(context)
         except KeyboardInterrupt:
             fail("interrupted", status=INTERRUPTED)
+        except ModuleNotFoundError as error:
+            if not install_hint(error):
+                raise
+            fail(error, status=1)
         except MemoryError:
             fail("the memory is too small for what was asked for", status=1)
         except OSError as error:

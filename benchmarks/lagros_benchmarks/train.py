@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lagros_benchmarks.outputs import Delivery, check_outputs
 from lagros_benchmarks.terminal import fail, listed
 
 if TYPE_CHECKING:
@@ -93,6 +94,8 @@ def train(
             from lagros_benchmarks.canvas import check_figure_path
 
             check_figure_path(figure)
+        places = {f"--out (seed {run.seed})": folder_of(run, out) / "record.json" for run in runs}
+        check_outputs({"--json": json, "--figure": figure, **places})
     except ValueError as error:
         fail(error)
     _say_what_happens()
@@ -100,12 +103,10 @@ def train(
         records = [
             _train_one(run, out, segments, residual, tensorboard, parallel_env) for run in runs
         ]
-        written = _write_curves(records, json, figure)
     except (ImportError, ValueError, OSError) as error:
         # An extra that is not installed, a folder of another run, a full disk.
         fail(error, status=1)
-    for path in written:
-        typer.echo(f"wrote {path}")
+    _write_curves(records, json, figure).tell()
 
 
 def folder_of(run: Training, out: Path) -> Path:
@@ -153,17 +154,15 @@ def _train_one(
 
 def _write_curves(
     records: Sequence[dict[str, Any]], json: Path | None, figure: Path | None
-) -> list[Path]:
-    written: list[Path] = []
+) -> Delivery:
+    delivery = Delivery()
     if json is None and figure is None:
-        return written
-    from lagros_benchmarks.files import write_json
+        return delivery
+    from lagros_benchmarks.files import json_text
     from lagros_benchmarks.surroundings import own_command
     from lagros_benchmarks.training.curves import curves_of, draw
 
     curves = curves_of(records, " ".join(own_command()))
-    if json is not None:
-        written.append(write_json(json, curves))
-    if figure is not None:
-        written.append(draw(curves, figure))
-    return written
+    delivery.write_text(json, lambda: json_text(curves))
+    delivery.write(figure, lambda path: draw(curves, path))
+    return delivery

@@ -1,11 +1,10 @@
-"""Frames into a GIF or an MP4, written whole or not at all."""
+"""Frames into a GIF or an MP4."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import itertools
-import os
 import subprocess
 import tempfile
 import zlib
@@ -15,8 +14,6 @@ from typing import IO, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
-
-from lagros_benchmarks.files import write_atomic
 
 Frame = NDArray[np.uint8]
 
@@ -46,26 +43,20 @@ def check_video_path(path: Path) -> None:
         _import_pillow()
 
 
-def write_video(path: Path, frames: Iterable[Frame], rate: float) -> Path:
-    """Write a video; its suffix says which kind.
+def video_bytes(kind: str, frames: Iterable[Frame], rate: float) -> bytes:
+    """Return the content of a video.
 
     Args:
-        path: Ends in .gif or .mp4; its folder is made if need be.
+        kind: ".gif" or ".mp4".
         frames: Each of one shape (height, width, 3), height and width even.
         rate: Frames per second. A GIF counts in hundredths of a second and takes the nearest.
 
-    Returns:
-        The path.
-
     Raises:
-        ValueError: The suffix is another, or there is no frame.
+        ValueError: There is no frame.
         ImportError: The package that writes this kind is not installed.
-        OSError: The file cannot be written.
+        OSError: There is no room for it.
     """
-    check_video_path(path)
-    if path.suffix.lower() == ".gif":
-        return write_atomic(path, gif_bytes(frames, rate))
-    return _write_mp4(path, frames, rate)
+    return gif_bytes(frames, rate) if kind == ".gif" else _mp4_bytes(frames, rate)
 
 
 def gif_bytes(frames: Iterable[Frame], rate: float) -> bytes:
@@ -75,7 +66,7 @@ def gif_bytes(frames: Iterable[Frame], rate: float) -> bytes:
     what a GIF compresses well.
 
     Args:
-        frames: As in `write_video`.
+        frames: As in `video_bytes`.
         rate: Frames per second.
 
     Raises:
@@ -137,22 +128,21 @@ def common_colours(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.array(chosen, np.uint8)
 
 
-def _write_mp4(path: Path, frames: Iterable[Frame], rate: float) -> Path:
+def _mp4_bytes(frames: Iterable[Frame], rate: float) -> bytes:
     ffmpeg = _import_ffmpeg()
     iterator: Iterator[Frame] = iter(frames)
     first = next(iterator, None)
     if first is None:
         raise ValueError("there is no frame to write")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # ffmpeg tells the format from the suffix.
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.mp4")
     height, width, _ = first.shape
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{rate:.6g}"]
     # yuv420p is what every player shows; faststart lets a page play it while it loads.
     coded = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "23", "-movflags", "+faststart"]
     quiet = [ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
-    command = [*quiet, *raw, "-i", "-", "-an", *coded, str(temporary)]
-    try:
+    with tempfile.TemporaryDirectory(prefix="lagros-") as folder:
+        # ffmpeg tells the format from the suffix.
+        film = Path(folder) / "film.mp4"
+        command = [*quiet, *raw, "-i", "-", "-an", *coded, str(film)]
         with tempfile.TemporaryFile() as complaints:
             # If ffmpeg gives up it closes the pipe, and its return code says so.
             with (
@@ -164,11 +154,8 @@ def _write_mp4(path: Path, frames: Iterable[Frame], rate: float) -> Path:
             if process.returncode != 0:
                 complaints.seek(0)
                 text = complaints.read().decode(errors="replace").strip()
-                raise OSError(f"ffmpeg could not write {str(path)!r}: {text}")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
+                raise OSError(f"ffmpeg could not make the film: {text}")
+        return film.read_bytes()
 
 
 def _import_ffmpeg() -> Any:

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from lagros_benchmarks.outputs import Delivery, check_outputs, policy_files
 from lagros_benchmarks.terminal import fail, find_users_modules
 
 
@@ -66,6 +67,7 @@ def watch(
     """Watch one episode: agents, thrusters, sensing, tubes, goals, collisions."""
     from lagros_benchmarks.library import SetupError
     from lagros_benchmarks.playback import Playback, WatchSettings
+    from lagros_envs.files import write_atomic
 
     find_users_modules()
     try:
@@ -84,13 +86,16 @@ def watch(
             seconds=seconds,
         )
         playback = Playback(settings)
+        check_outputs({"--video": video}, {"--scenario": scenario, **policy_files([policy])})
     except (ValueError, OSError) as error:
         fail(error)
     except (ImportError, SetupError) as error:
         fail(error, status=1)
     try:
-        written = playback.play()
+        film = playback.play()
     except KeyboardInterrupt:
+        if video is not None:
+            raise
         raise typer.Exit from None
     except (ImportError, OSError) as error:
         fail(error, status=1)
@@ -99,8 +104,9 @@ def watch(
         fail(f"{type(error).__name__}: {error}", status=1)
     finally:
         playback.close()
+    delivery = Delivery()
+    content = film or b""
+    delivery.write(video, lambda path: write_atomic(path, content))
     for line in playback.summary():
         typer.echo(line)
-    if written is not None:
-        size = written.stat().st_size / 1e6
-        typer.echo(f"wrote {written} ({playback.frames} frames, {size:.2g} MB)")
+    delivery.tell(f"{playback.frames} frames, {len(content) / 1e6:.2g} MB")

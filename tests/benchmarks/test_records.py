@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from lagros_benchmarks.files import plain, write_json, write_json_lines
+from lagros_benchmarks.files import json_lines_text, plain, write_atomic, write_json
 from lagros_benchmarks.records import episode_objects, summarise
 from lagros_benchmarks.runner import Case, run_benchmark
 from lagros_benchmarks.settings import BenchmarkSettings
@@ -128,7 +128,7 @@ def test_the_json_is_strict_and_reads_back(rows, tmp_path):
 
 
 def test_every_episode_is_a_line(run, tmp_path):
-    path = write_json_lines(tmp_path / "episodes.jsonl", episode_objects(run))
+    path = write_atomic(tmp_path / "episodes.jsonl", json_lines_text(episode_objects(run)))
     lines = [json.loads(line, parse_constant=pytest.fail) for line in path.read_text().splitlines()]
     assert len(lines) == 4 * 40
     assert [line["seed"] for line in lines[:40]] == run.settings.episode_seeds()

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from lagros_benchmarks.files import write_json, write_json_lines
+from lagros_benchmarks.files import json_lines_text, write_atomic, write_json
 from lagros_benchmarks.metrics import wilson_interval
 from lagros_benchmarks.records import episode_objects, summarise
 from lagros_benchmarks.runner import Case, run_benchmark
@@ -227,7 +227,7 @@ def test_a_run_becomes_json_and_lines(flown, tmp_path):
         ("spring", True),
         ("joint", True),
     ]
-    path = write_json_lines(tmp_path / "agents.jsonl", episode_objects(flown))
+    path = write_atomic(tmp_path / "agents.jsonl", json_lines_text(episode_objects(flown)))
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     assert len(lines) == 4 * 4 * 2
     for row in read:
