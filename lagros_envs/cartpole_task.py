@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_multiple, check_not_negative, check_positive
+from lagros_envs.checks import check_fields, check_multiple, check_not_negative, check_positive
 from lagros_envs.dynamics import CartPole
 from lagros_envs.options import nominal_option
 from lagros_envs.tube import PaperTube
@@ -74,10 +74,10 @@ class CartPoleSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, int | float):
-                check_not_negative(item.name, value)
+            if item.type == "float":
+                check_not_negative(item.name, getattr(self, item.name))
         for name in ("control_period", "time_limit", "force_scale"):
             check_positive(name, getattr(self, name))
         if self.force_limit is not None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
 from lagros_envs.autoreset import RestartingVectorEnv, nominal_after
-from lagros_envs.checks import check_at_least
+from lagros_envs.checks import check_whole
 from lagros_envs.disturbances import Disturbance, Situation, channel_mask
 from lagros_envs.dynamics.held import HeldBatch
 from lagros_envs.seeding import seeded_streams
@@ -64,7 +64,7 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         render_mode: str | None = None,
     ) -> None:
         """Build the worlds; see the class for the arguments."""
-        check_at_least("num_envs", num_envs, 1)
+        check_whole("num_envs", num_envs)
         self.settings = settings or task.CartPoleSettings()
         self.named_space = task.named_space(self.settings)
         super().__init__(

@@ -11,7 +11,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_at_least, check_not_negative, check_positive
+from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 from lagros_envs.files import write_atomic
 from lagros_envs.reachable import way_exists
 
@@ -182,6 +182,7 @@ class Preset:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         for name in ("arena", "obstacle_radius", "agent_radius"):
             check_positive(name, getattr(self, name))
         check_not_negative("core_radius", self.core, "or None for agent_radius")
@@ -190,7 +191,7 @@ class Preset:
         fewest, most = self.obstacle_count
         if not 0 <= fewest <= most:
             raise ValueError(f"obstacle_count={self.obstacle_count!r} must be 0 <= fewest <= most")
-        check_at_least("agents", self.agents, 1)
+        check_whole("agents", self.agents)
         if self.layout not in ("random", "antipodal"):
             raise ValueError(f'layout={self.layout!r} must be "random" or "antipodal"')
 
@@ -206,7 +207,7 @@ class Preset:
             ValueError: The number is less than 1.
         """
         count = self.agents if num_agents is None else num_agents
-        check_at_least("num_agents", count, 1)
+        check_whole("num_agents", count)
         if not self.grows:
             return replace(self, agents=count)
         share = max(1.0, count / self.agents)

@@ -11,7 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_at_least, check_multiple, check_not_negative, check_positive
+from lagros_envs.checks import (
+    check_fields,
+    check_multiple,
+    check_not_negative,
+    check_positive,
+    check_whole,
+)
 from lagros_envs.dynamics.spacecraft import Spacecraft
 from lagros_envs.options import nominal_option
 from lagros_envs.tube import PaperTube
@@ -68,10 +74,10 @@ class SpacecraftSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, int | float):
-                check_not_negative(item.name, value)
+            if item.type == "float":
+                check_not_negative(item.name, getattr(self, item.name))
         for name in ("control_period", "horizon", "time_limit", "goal_radius", "thrust_scale"):
             check_positive(name, getattr(self, name))
         if self.thrust_limit is not None:
@@ -93,7 +99,7 @@ def limited(settings: SpacecraftSettings, steps: int | None) -> SpacecraftSettin
     """
     if steps is None:
         return settings
-    check_at_least("max_cycles", steps, 1, "or None for the time limit")
+    check_whole("max_cycles", steps)
     return replace(settings, time_limit=steps * settings.control_period)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
 from lagros_envs.autoreset import RestartingVectorEnv, nominal_after
-from lagros_envs.checks import check_at_least
+from lagros_envs.checks import check_whole
 from lagros_envs.observation import (
     global_state,
     named_state_space,
@@ -75,7 +75,7 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         render_mode: str | None = None,
     ) -> None:
         """Build the worlds; see the class for the arguments."""
-        check_at_least("num_agents", num_agents, 1)
+        check_whole("num_agents", num_agents)
         if num_envs < 1 or num_envs % num_agents:
             raise ValueError(
                 f"num_envs={num_envs!r} must be a positive multiple of num_agents={num_agents}: "

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lagros_envs.checks import check_positive
+from lagros_envs.checks import check_fields, check_positive
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +31,7 @@ class PaperTube:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         for name in ("steady_radius", "contraction_rate"):
             check_positive(name, getattr(self, name))
 

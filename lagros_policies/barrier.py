@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_not_negative, check_positive
+from lagros_envs.checks import check_fields, check_not_negative, check_positive
 from lagros_policies.sensed import Sensed
 
 FloatArray = NDArray[np.float64]
@@ -84,6 +84,7 @@ class BarrierSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         may_be_zero = (
             "pair_margin",
             "obstacle_margin",

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
-from lagros_envs.checks import check_at_least, check_not_negative
+from lagros_envs.checks import check_not_negative, check_whole
 from lagros_envs.observation import Layout
 from lagros_envs.scenarios import Preset
 from lagros_policies.contraction.double_integrator import planned_margin
@@ -130,7 +130,7 @@ class DistributedTubeMpcPolicy:
         """Build planner and law."""
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
-        check_at_least("replan_every", replan_every, 1)
+        check_whole("replan_every", replan_every)
         for name, time in (("kept_for", kept_for), ("smoothing", smoothing)):
             check_not_negative(name, time)
         body, period = self.settings.system, self.settings.control_period

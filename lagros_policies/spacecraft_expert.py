@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_positive
+from lagros_envs.checks import check_fields, check_positive
 from lagros_envs.scenarios import Scenario
 from lagros_envs.spacecraft_task import STATE_DIM, SpacecraftSettings
 from lagros_policies.centralized import planner_settings
@@ -57,6 +57,7 @@ class SpacecraftExpertSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         for item in fields(self):
             check_positive(item.name, getattr(self, item.name))
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
-from lagros_envs.checks import check_above, check_at_least
+from lagros_envs.checks import check_above, check_whole
 from lagros_policies.contraction import ContractionMetric, load_metric
 from lagros_policies.expert import CartPoleExpert, TrackedPlans
 from lagros_policies.planning import Trajectory
@@ -79,7 +79,7 @@ class TubeMpcPolicy:
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Build planner and law."""
-        check_at_least("replan_every", replan_every, 1)
+        check_whole("replan_every", replan_every)
         check_above("deadline", deadline, 0)
         self.settings = settings or task.CartPoleSettings()
         if metric is None or isinstance(metric, str | Path):

@@ -17,7 +17,13 @@ from lagros_benchmarks import library
 from lagros_benchmarks.settings import unknown_name
 from lagros_benchmarks.video import FRAME_RATES, Frame, check_video_path, video_bytes
 from lagros_envs import spacecraft_v0
-from lagros_envs.checks import check_at_least, check_not_negative, check_positive, check_seed
+from lagros_envs.checks import (
+    check_fields,
+    check_not_negative,
+    check_positive,
+    check_seed,
+    check_whole,
+)
 from lagros_envs.disturbances import KINDS
 from lagros_envs.scenarios import PRESETS, Preset, Scenario, preset_named
 from lagros_envs.seeding import episode_streams
@@ -68,6 +74,7 @@ class WatchSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         if self.task not in TASKS:
             raise ValueError(unknown_name("task", self.task, TASKS))
         if self.disturbance not in WATCHED_KINDS:
@@ -75,7 +82,7 @@ class WatchSettings:
         if self.preset is not None and self.preset not in PRESETS:
             raise ValueError(unknown_name("preset", self.preset, PRESETS))
         if self.agents is not None:
-            check_at_least("agents", self.agents, 1)
+            check_whole("agents", self.agents)
         check_seed(self.seed)
         if self.bound is not None:
             check_not_negative("bound", self.bound)

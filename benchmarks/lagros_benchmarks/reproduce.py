@@ -20,6 +20,7 @@ from lagros_benchmarks.experiment import Progress
 from lagros_benchmarks.reproduction import Say
 from lagros_benchmarks.settings import BenchmarkSettings
 from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.checks import check_fields
 from lagros_envs.files import write_atomic
 from lagros_policies.backends import LOKY, Backend
 from lagros_policies.contraction import Metric, load_metric, save_metric
@@ -65,6 +66,7 @@ class ReproduceSettings:
 
     def __post_init__(self) -> None:
         """Check, before hours of work, what the benchmark at their end will ask."""
+        check_fields(self)
         self.benchmark(None)
 
     def make(self, folder: Path, progress: Progress, say: Say) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from lagros_benchmarks.experiment import Progress
 from lagros_benchmarks.reproduction import Say
 from lagros_benchmarks.settings import BenchmarkSettings
+from lagros_envs.checks import check_fields
 from lagros_envs.files import write_atomic
 from lagros_envs.scenarios import preset_named
 from lagros_envs.spacecraft_task import SpacecraftSettings
@@ -100,6 +101,7 @@ class SpacecraftReproduceSettings:
 
     def __post_init__(self) -> None:
         """Check, before hours of work, what the benchmark at their end will ask."""
+        check_fields(self)
         self.benchmark(None)
 
     def make(self, folder: Path, progress: Progress, say: Say) -> None:

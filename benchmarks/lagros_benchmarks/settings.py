@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lagros_envs.checks import check_at_least, check_not_negative, check_seed
+from lagros_envs.checks import check_fields, check_not_negative, check_seed, check_whole
 from lagros_envs.disturbances import KINDS
 from lagros_envs.seeding import EVALUATION, episode_seeds
 from lagros_policies.backends import LOKY, Backend
@@ -165,6 +165,7 @@ class BenchmarkSettings:
 
     def __post_init__(self) -> None:
         """Check the settings."""
+        check_fields(self)
         check_task(self.task)
         for name in ("policies", "disturbances", "bounds", "agents"):
             values = getattr(self, name)
@@ -180,7 +181,7 @@ class BenchmarkSettings:
         if self.channels not in CHANNELS:
             raise ValueError(unknown_name("channels", self.channels, CHANNELS))
         for name in ("episodes", "jobs", "chunk", "timing_episodes"):
-            check_at_least(name, getattr(self, name), 1)
+            check_whole(name, getattr(self, name))
         check_seed(self.seed)
         if self.task == "cartpole":
             self._check_alone()
@@ -206,7 +207,7 @@ class BenchmarkSettings:
         if self.safety_filter not in SAFETY_FILTERS:
             raise ValueError(unknown_name("safety filter", self.safety_filter, SAFETY_FILTERS))
         for count in self.agents:
-            check_at_least("agents", count, 1)
+            check_whole("agents", count)
         if "worst" in self.disturbances:
             raise ValueError(
                 "disturbance 'worst' pushes away from one nominal trajectory that all policies "

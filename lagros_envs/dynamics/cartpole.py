@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from lagros_envs.checks import check_not_negative, check_positive
+from lagros_envs.checks import check_fields, check_not_negative, check_positive
 from lagros_envs.dynamics.system import Components
 
 POSITION, ANGLE, VELOCITY, ANGULAR_RATE = range(4)
@@ -39,6 +39,7 @@ class CartPole:
 
     def __post_init__(self) -> None:
         """Check that the parameters are physical."""
+        check_fields(self)
         for field in fields(self):
             check = check_not_negative if field.name.endswith("friction") else check_positive
             check(field.name, getattr(self, field.name))

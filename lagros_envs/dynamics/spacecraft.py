@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from lagros_envs.checks import check_positive
+from lagros_envs.checks import check_fields, check_positive
 from lagros_envs.dynamics.system import Components
 
 X, Y, HEADING, VELOCITY_X, VELOCITY_Y, SPIN = range(6)
@@ -36,6 +36,7 @@ class Spacecraft:
 
     def __post_init__(self) -> None:
         """Check that the parameters are physical."""
+        check_fields(self)
         for field in fields(self):
             check_positive(field.name, getattr(self, field.name))
 

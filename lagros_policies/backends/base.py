@@ -8,6 +8,8 @@ import socket
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from lagros_envs.checks import check_fields
+
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
@@ -42,6 +44,7 @@ class Backend:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         if self.name not in BACKENDS:
             raise ValueError(f"unknown backend {self.name!r}. Valid: {', '.join(BACKENDS)}.")
         if self.name == "loky" and self.address is not None:

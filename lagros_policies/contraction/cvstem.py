@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from lagros_envs.checks import check_at_least, check_positive
+from lagros_envs.checks import check_fields, check_positive, check_whole
 from lagros_envs.dynamics import System, control_matrix, state_dependent_coefficient
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.metric import (
@@ -76,8 +76,9 @@ class CvStemSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         check_positive("contraction_rate", self.contraction_rate)
-        check_at_least("degree", self.degree, 0)
+        check_whole("degree", self.degree, 0)
         if not self.control_penalty > 0.0:
             raise ValueError(
                 f"control_penalty={self.control_penalty!r} must be > 0: without it nu is unbounded"

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_fields, check_whole
 from lagros_envs.tube import PaperTube
 
 FloatArray = NDArray[np.float64]
@@ -94,6 +95,9 @@ class FeedbackSettings:
         lookahead: Steps foreseen.
         sharpness: Of the soft maximum over these.
         tube: The published tube, in whose radii errors are measured.
+
+    Raises:
+        ValueError: A value is of another type, or no step is foreseen.
     """
 
     tight: WeightSchedule = _TIGHT
@@ -103,6 +107,11 @@ class FeedbackSettings:
     lookahead: int = 3
     sharpness: float = 12.0
     tube: PaperTube = field(default_factory=PaperTube)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_fields(self)
+        check_whole("lookahead", self.lookahead)
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from lagros_envs.checks import check_at_least, check_not_negative, check_positive
+from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 from lagros_envs.dynamics import System, control_matrix, jacobian
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.cvstem import InfeasibleError
@@ -93,10 +93,11 @@ class HeldDesign:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         for name in ("period", "rate", "disturbance_bound", "control_penalty", "floor"):
             check_positive(name, getattr(self, name))
         check_not_negative("margin", self.margin)
-        check_at_least("degree", self.degree, 1)
+        check_whole("degree", self.degree)
         if self.output is not None and len(self.output) != _STATES:
             raise ValueError(f"output={self.output!r} must have {_STATES} entries")
 

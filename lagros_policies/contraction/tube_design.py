@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from lagros_envs.checks import check_not_negative, check_positive
+from lagros_envs.checks import check_fields, check_not_negative, check_positive
 from lagros_envs.dynamics import System, control_matrix, jacobian
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.cvstem import InfeasibleError
@@ -69,6 +69,7 @@ class PlanBox:
 
     def __post_init__(self) -> None:
         """Check the bounds."""
+        check_fields(self)
         for item in fields(self):
             check_not_negative(item.name, getattr(self, item.name))
 
@@ -117,6 +118,7 @@ class TubeDesign:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         for name in ("rate", "disturbance_bound", "control_penalty", "floor"):
             check_positive(name, getattr(self, name))
         check_not_negative("margin", self.margin)

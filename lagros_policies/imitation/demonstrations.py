@@ -18,7 +18,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_at_least, check_not_negative, check_seed
+from lagros_envs.checks import check_fields, check_not_negative, check_seed, check_whole
 from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.observation import global_state
 from lagros_envs.seeding import episode_seeds
@@ -58,9 +58,10 @@ class DemonstrationSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         if self.task not in ENVIRONMENTS:
             raise ValueError(f"task={self.task!r} must be one of {', '.join(ENVIRONMENTS)}")
-        check_at_least("episodes", self.episodes, 1)
+        check_whole("episodes", self.episodes)
         check_seed(self.seed)
         if self.disturbance not in OPEN_LOOP:
             raise ValueError(

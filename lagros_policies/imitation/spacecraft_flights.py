@@ -17,7 +17,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_above, check_at_least, check_each, check_not_negative
+from lagros_envs.checks import (
+    check_above,
+    check_each,
+    check_fields,
+    check_not_negative,
+    check_whole,
+)
 from lagros_envs.observation import Layout, observe
 from lagros_envs.scenarios import Preset, preset_named
 from lagros_envs.seeding import episode_seeds, episode_streams
@@ -73,12 +79,13 @@ class FlightSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         if self.worlds_per_shard < 1 or self.worlds < 1 or self.worlds % self.worlds_per_shard:
             raise ValueError(
                 f"worlds_per_shard={self.worlds_per_shard} must divide worlds={self.worlds}"
             )
         check_each("agents", self.agents, 1)
-        check_at_least("sample_every", self.sample_every, 1)
+        check_whole("sample_every", self.sample_every)
         check_not_negative("disturbance_bound", self.disturbance_bound)
         if not 0.0 <= self.open_share <= 1.0:
             raise ValueError(f"open_share={self.open_share!r} must be in [0, 1]")

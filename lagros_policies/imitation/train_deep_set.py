@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_at_least, check_each, check_positive
+from lagros_envs.checks import check_each, check_fields, check_positive, check_whole
 from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_policies.imitation.deep_set import OUTPUTS, DeepSet
 from lagros_policies.imitation.fitting import Fit, IntArray, one_thread
@@ -65,10 +65,11 @@ class DeepSetTraining:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         for name in ("element", "agent"):
             check_each(name, getattr(self, name), 1)
         for name in ("epochs", "batch", "checkpoint_every"):
-            check_at_least(name, getattr(self, name), 1)
+            check_whole(name, getattr(self, name))
         for name in ("learning_rate", "outlier"):
             check_positive(name, getattr(self, name))
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.cartpole_task import FALL_ANGLE, CartPoleSettings
-from lagros_envs.checks import check_positive
+from lagros_envs.checks import check_fields, check_positive
 from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_policies.contraction.tube import tighten
 from lagros_policies.planning.scp import ScpSettings, ScpSolver
@@ -41,6 +41,7 @@ class CartPolePlannerSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         if not 0.0 <= self.angle_margin < FALL_ANGLE:
             raise ValueError(f"angle_margin={self.angle_margin!r} must be in [0, pi/2)")
         check_positive("margin_rate", self.margin_rate)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
-from lagros_envs.checks import check_not_negative, check_positive
+from lagros_envs.checks import check_fields, check_not_negative, check_positive
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -49,6 +49,7 @@ class GridSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         for item in fields(self):
             check_not_negative(item.name, getattr(self, item.name))
         for name in ("cell", "search_cell", "search_period"):

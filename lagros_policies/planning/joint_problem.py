@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_above
+from lagros_envs.checks import check_above, check_fields
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -45,6 +45,7 @@ class JointScpSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         for item in fields(self):
             check_above(item.name, getattr(self, item.name), 0)
 

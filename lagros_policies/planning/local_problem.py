@@ -10,7 +10,7 @@ import numpy as np
 import piqp
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_not_negative, check_positive, check_whole
+from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 from lagros_policies.planning.grid_path import walk
 from lagros_policies.planning.local_guess import pass_aside, progress, way_around
 from lagros_policies.planning.local_motion import (
@@ -79,6 +79,7 @@ class LocalPlannerSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         for item in fields(self):
             check_not_negative(item.name, getattr(self, item.name))
         for name in ("mass", "near_period", "speed_limit", "penalty", "qp_tolerance"):

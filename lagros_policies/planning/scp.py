@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from lagros_envs.checks import check_above
+from lagros_envs.checks import check_above, check_fields
 from lagros_envs.dynamics import System, hold_step, linearise_hold
 from lagros_policies.planning.qp import UNBOUNDED, QuadraticProgram, solve_qp
 from lagros_policies.planning.trajectory import Trajectory
@@ -54,6 +54,7 @@ class ScpSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         for item in fields(self):
             check_above(item.name, getattr(self, item.name), 0)
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_at_least, check_not_negative, check_positive
+from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 from lagros_policies.planning.grid_path import (
     GridSettings,
     search_in_turn,
@@ -85,6 +85,7 @@ class SpacecraftPlannerSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         for name in ("horizon", "control_period", "mass", "speed_limit", "check_period"):
             check_positive(name, getattr(self, name))
         for name in ("pair_share", "margin_growth", "start_margin"):
@@ -93,7 +94,7 @@ class SpacecraftPlannerSettings:
         if not self.margins or list(self.margins) != falling or not 0.0 <= falling[-1] < math.inf:
             raise ValueError(f"margins={self.margins!r} must be falling numbers >= 0, at least one")
         for name, least in (("nodes", 2), ("candidates", 1), ("restarts", 0), ("searches", 0)):
-            check_at_least(name, getattr(self, name), least)
+            check_whole(name, getattr(self, name), least)
         divisor("control_period", self.control_period, self.node_period)
         divisor("check_period", self.check_period, self.node_period)
 

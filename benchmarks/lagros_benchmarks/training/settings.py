@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any, ClassVar
 
 from lagros_envs.cartpole_task import CartPoleSettings
-from lagros_envs.checks import check_positive, check_whole
+from lagros_envs.checks import check_fields, check_positive, check_whole
 from lagros_envs.seeding import EVALUATION
 
 # Segments are namespaces of their own in `lagros_envs.seeding`'s sense, far below `EVALUATION`.
@@ -32,6 +32,7 @@ class _Ranged:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        check_fields(self)
         for name in self.positive:
             check_positive(name, getattr(self, name))
         for name in self.counts:

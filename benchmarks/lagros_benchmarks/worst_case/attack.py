@@ -47,7 +47,7 @@ from lagros_benchmarks.worst_case.spacecraft import (
     first_adversaries,
 )
 from lagros_envs import spacecraft_task
-from lagros_envs.checks import check_at_least, check_positive, check_seed
+from lagros_envs.checks import check_fields, check_positive, check_seed, check_whole
 from lagros_envs.disturbances import Disturbance
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
@@ -101,13 +101,14 @@ class AttackSettings:
 
     def __post_init__(self) -> None:
         """Check the settings."""
+        check_fields(self)
         check_task(self.task)
         check_policy(self.policy, self.task)
         if self.goal not in GOALS:
             raise ValueError(f"goal={self.goal!r} must be one of {', '.join(GOALS)}")
         check_positive("bound", self.bound)
         for name in ("episodes", "agents"):
-            check_at_least(name, getattr(self, name), 1)
+            check_whole(name, getattr(self, name))
         check_seed(self.seed)
         if self.safety_filter and self.task == "cartpole":
             raise ValueError("safety_filter=True is for the task spacecraft; leave it out")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lagros_benchmarks.worst_case.optimisers import OPTIMISERS, make_search
 from lagros_benchmarks.worst_case.sequences import PARAMETRISATIONS, Parametrisation
-from lagros_envs.checks import check_at_least
+from lagros_envs.checks import check_fields, check_whole
 from lagros_envs.disturbances import into_unit_ball, onto_unit_sphere
 
 FloatArray = NDArray[np.float64]
@@ -87,6 +87,7 @@ class SearchSettings:
 
     def __post_init__(self) -> None:
         """Check the settings."""
+        check_fields(self)
         for name, valid in (
             ("method", METHODS),
             ("optimiser", OPTIMISERS),
@@ -97,7 +98,7 @@ class SearchSettings:
                     f"{name}={getattr(self, name)!r} must be one of {', '.join(valid)}"
                 )
         for name, least in (("pieces", 1), ("budget", 1), ("population", 2), ("restarts", 1)):
-            check_at_least(name, getattr(self, name), least)
+            check_whole(name, getattr(self, name), least)
 
 
 @dataclass(frozen=True)

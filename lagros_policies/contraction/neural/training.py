@@ -10,7 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_at_least, check_each, check_not_negative, check_positive
+from lagros_envs.checks import (
+    check_each,
+    check_fields,
+    check_not_negative,
+    check_positive,
+    check_whole,
+)
 from lagros_envs.dynamics import System, control_matrix, state_dependent_coefficient
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.cvstem import Samples
@@ -66,9 +72,10 @@ class NeuralTrainingSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
+        check_fields(self)
         check_each("hidden", self.hidden, 1)
         for name, least in (("fit_steps", 1), ("batch", 1), ("condition_steps", 0)):
-            check_at_least(name, getattr(self, name), least)
+            check_whole(name, getattr(self, name), least)
         check_positive("learning_rate", self.learning_rate)
         check_not_negative("margin", self.margin)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 
-from lagros_envs.checks import check_not_negative
+from lagros_envs.checks import check_fields, check_not_negative
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class ProofBox:
 
     def __post_init__(self) -> None:
         """Check the bounds."""
+        check_fields(self)
         for item in fields(self):
             check_not_negative(item.name, getattr(self, item.name))
         if self.angle >= math.pi / 2:

@@ -16,6 +16,7 @@ from numpy.polynomial import chebyshev, polynomial
 from numpy.typing import NDArray
 from scipy import sparse
 
+from lagros_envs.checks import check_fields
 from lagros_envs.dynamics import CartPole, control_matrix, jacobian, linearise_hold
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.cvstem import CvStemSettings, InfeasibleError
@@ -70,6 +71,7 @@ class ProvedDesignSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
+        check_fields(self)
         if self.rounds < 1 or not (self.period > 0.0 and self.most_seconds > 0.0):
             raise ValueError("rounds must be at least 1, period and most_seconds positive")
 
