@@ -33,7 +33,7 @@ def check_positive(name: str, value: float, otherwise: str = "") -> None:
     Raises:
         ValueError: It is no number, or zero, negative, infinite or NaN.
     """
-    holds = _is_number(value) and math.isfinite(value) and value > 0.0
+    holds = is_finite(value) and value > 0.0
     _check(holds, name, value, "finite and > 0", otherwise)
 
 
@@ -43,7 +43,7 @@ def check_not_negative(name: str, value: float, otherwise: str = "") -> None:
     Raises:
         ValueError: It is no number, or negative, infinite or NaN.
     """
-    holds = _is_number(value) and math.isfinite(value) and value >= 0.0
+    holds = is_finite(value) and value >= 0.0
     _check(holds, name, value, "finite and >= 0", otherwise)
 
 
@@ -53,7 +53,7 @@ def check_at_least(name: str, value: float, least: float, otherwise: str = "") -
     Raises:
         ValueError: It is no number, less than `least`, or NaN.
     """
-    _check(_is_number(value) and value >= least, name, value, f"at least {least}", otherwise)
+    _check(is_number(value) and value >= least, name, value, f"at least {least}", otherwise)
 
 
 def check_above(name: str, value: float, bound: float, otherwise: str = "") -> None:
@@ -62,7 +62,7 @@ def check_above(name: str, value: float, bound: float, otherwise: str = "") -> N
     Raises:
         ValueError: It is no number, `bound` or less, or NaN.
     """
-    _check(_is_number(value) and value > bound, name, value, f"> {bound}", otherwise)
+    _check(is_number(value) and value > bound, name, value, f"> {bound}", otherwise)
 
 
 def check_fields(settings: Any) -> None:
@@ -98,7 +98,7 @@ def check_each(name: str, values: Sequence[int], least: int, most: int | None = 
     needed = f"one whole number or more, each at least {least}"
     needed += "" if most is None else f" and at most {most}"
     check_several(name, values, needed)
-    holds = all(_is_whole(one) and one >= least for one in values)
+    holds = all(is_whole(one) and one >= least for one in values)
     _check(holds and (most is None or max(values) <= most), name, values, needed)
 
 
@@ -137,7 +137,7 @@ def check_multiple(
     Raises:
         ValueError: Their ratio is out of range, or further from whole.
     """
-    ratio = value / unit if _is_number(value) else math.nan
+    ratio = value / unit if is_number(value) else math.nan
     whole = math.isfinite(ratio) and abs(ratio - round(ratio)) <= tolerance
     holds = whole and 1 <= round(ratio) <= most
     _check(holds, name, value, f"a whole number of {unit_name}={shown(unit)}, from 1 to {most}")
@@ -155,7 +155,7 @@ def check_whole(name: str, value: float, least: int = 1, most: int | None = None
     Raises:
         ValueError: It is no integer, or out of range.
     """
-    holds = _is_whole(value) and value >= least and (most is None or value <= most)
+    holds = is_whole(value) and value >= least and (most is None or value <= most)
     needed = f"a whole number >= {least}" if most is None else f"a whole number, {least} to {most}"
     _check(holds, name, value, needed)
 
@@ -166,7 +166,7 @@ def check_seed(seed: int) -> None:
     Raises:
         ValueError: It is no integer, or negative.
     """
-    _check(_is_whole(seed) and seed >= 0, "seed", seed, "a non-negative integer")
+    _check(is_whole(seed) and seed >= 0, "seed", seed, "a non-negative integer")
 
 
 def check_flag(name: str, value: bool) -> None:
@@ -214,6 +214,27 @@ def shown(value: object) -> str:
     return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 1]}…"
 
 
+def is_number(value: object) -> TypeGuard[float]:
+    """Return whether a value is a real number that a double reaches, NaN and infinity included."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        return False
+    try:
+        float(value)
+    except OverflowError:
+        return False
+    return True
+
+
+def is_finite(value: object) -> TypeGuard[float]:
+    """Return whether a value is a number, and finite."""
+    return is_number(value) and math.isfinite(value)
+
+
+def is_whole(value: object) -> TypeGuard[int]:
+    """Return whether a value is an integer; True is none."""
+    return not isinstance(value, bool) and isinstance(value, Integral)
+
+
 @cache
 def _hints(kind: Any) -> dict[str, Any]:
     hints = get_type_hints(kind)
@@ -232,9 +253,9 @@ def _unmet(value: object, hint: Any) -> str:
     if origin is tuple:
         return _unmet_tuple(value, parts)
     if hint is float:
-        return "" if _is_number(value) and math.isfinite(value) else "a finite number"
+        return "" if is_finite(value) else "a finite number"
     if hint is int:
-        return "" if _is_whole(value) else "a whole number"
+        return "" if is_whole(value) else "a whole number"
     if hint is bool:
         return "" if isinstance(value, bool) else "True or False"
     if hint is types.NoneType:
@@ -252,20 +273,6 @@ def _unmet_tuple(value: object, parts: tuple[Any, ...]) -> str:
     pairs = zip(value, [parts[0]] * len(value) if endless else parts, strict=True)
     unmet = [needed for needed in (_unmet(one, part) for one, part in pairs) if needed]
     return f"a tuple, each entry {unmet[0]}" if unmet else ""
-
-
-def _is_number(value: object) -> TypeGuard[float]:
-    if isinstance(value, bool) or not isinstance(value, Real):
-        return False
-    try:
-        float(value)
-    except OverflowError:
-        return False
-    return True
-
-
-def _is_whole(value: object) -> TypeGuard[int]:
-    return not isinstance(value, bool) and isinstance(value, Integral)
 
 
 def _check(holds: bool, name: str, value: object, needed: str, otherwise: str = "") -> None:

@@ -11,9 +11,17 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
+from lagros_envs.checks import (
+    check_fields,
+    check_not_negative,
+    check_positive,
+    check_whole,
+    shown,
+    suggestion,
+)
 from lagros_envs.files import write_atomic
 from lagros_envs.reachable import way_exists
+from lagros_envs.reading import Record
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -22,6 +30,8 @@ FORMAT = "lagros-scenario-1"
 ATTEMPTS = 1000  # of a whole scenario, before the density is called impossible
 DRAWS = 16  # of one obstacle, start or goal at a time ...
 ROUNDS = 12  # ... and how often, before the attempt is given up
+LARGEST = 1e9  # of a coordinate and a radius [m]
+MOST_AGENTS, MOST_OBSTACLES = 1000, 10_000  # all pairs of them are looked at
 GRID = 0.15  # cell of the grid on which a way is looked for [m]
 
 
@@ -54,7 +64,9 @@ class Scenario:
 
     def __post_init__(self) -> None:
         """Take read-only copies in double precision and check them."""
-        agents, obstacles = np.shape(self.starts)[0:1], np.shape(self.obstacle_radii)
+        names = ("starts", "headings", "goals", "obstacles", "obstacle_radii")
+        arrays = {name: _numbers(name, getattr(self, name)) for name in names}
+        agents, obstacles = arrays["starts"].shape[:1], arrays["obstacle_radii"].shape[:1]
         shapes = {
             "starts": (*agents, 2),
             "headings": agents,
@@ -63,21 +75,22 @@ class Scenario:
             "obstacle_radii": obstacles,
         }
         for name, shape in shapes.items():
-            value = np.array(getattr(self, name), dtype=np.float64)
-            if name == "obstacles" and value.size == 0:
-                value = value.reshape(0, 2)
-            if value.shape != shape or not np.all(np.isfinite(value)):
+            value = arrays[name]
+            if value.size == 0:
+                value = value.reshape(shape if 0 in shape else value.shape)
+            if value.shape != shape or not np.all(np.abs(value) <= LARGEST):
                 raise ValueError(
-                    f"{name} has shape {value.shape}; it must be finite and of shape {shape}, for "
-                    f"{len(self.starts)} agents and {np.size(self.obstacle_radii)} obstacles"
+                    f"{name} has shape {value.shape}; it must be finite, at most {LARGEST:g}, and "
+                    f"of shape {shape}, for {len(arrays['starts'])} agents and "
+                    f"{arrays['obstacle_radii'].size} obstacles"
                 )
             value.flags.writeable = False
             object.__setattr__(self, name, value)
-        if self.num_agents == 0:
-            raise ValueError("starts is empty; a scenario needs at least one agent")
+        check_whole("agents", self.num_agents, 1, MOST_AGENTS)
+        check_whole("obstacles", len(self.obstacles), 0, MOST_OBSTACLES)
+        check_positive("agent_radius", self.agent_radius)
         if self.core_radius is None:
             object.__setattr__(self, "core_radius", self.agent_radius)
-        check_positive("agent_radius", self.agent_radius)
         check_not_negative("core_radius", self.core, "or None for agent_radius")
         if np.any(self.obstacle_radii <= 0.0):
             raise ValueError(f"obstacle_radii={self.obstacle_radii.tolist()} must be > 0")
@@ -130,18 +143,38 @@ class Scenario:
             FileNotFoundError: There is no such file.
             ValueError: The file is not a scenario, or describes one that cannot be.
         """
+        record = Record.load(path, "a scenario")
+        record.must("format", FORMAT)
+        record.only(["format", *(item.name for item in fields(cls))])
+        core = record["core_radius"]
         try:
-            record = json.loads(Path(path).read_text(encoding="utf-8"))
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path} is not JSON: {error}") from error
-        names = {item.name for item in fields(cls)}
-        if not isinstance(record, dict) or record.pop("format", None) != FORMAT:
-            raise ValueError(f'{path} is not a scenario: its "format" is not "{FORMAT}"')
-        if set(record) != names:
-            raise ValueError(
-                f"{path} has the entries {sorted(record)}; a scenario has {sorted(names)}"
+            return cls(
+                starts=record.array("starts", (None, 2)),
+                headings=record.array("headings", (None,)),
+                goals=record.array("goals", (None, 2)),
+                obstacles=record.array("obstacles", (None, 2)),
+                obstacle_radii=record.array("obstacle_radii", (None,)),
+                agent_radius=record.number("agent_radius"),
+                core_radius=None if core is None else record.number("core_radius"),
             )
-        return cls(**record)
+        except ValueError as error:
+            text = str(error)
+            raise ValueError(text if record.name in text else f"{record.name}: {text}") from None
+
+
+def _numbers(name: str, value: Any) -> FloatArray:
+    """Return a copy of an array of real numbers.
+
+    Raises:
+        ValueError: It is no such array.
+    """
+    try:
+        array = np.array(value)
+    except ValueError:
+        array = np.array(None)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name}={shown(value)} must be numbers in lists of equal lengths")
+    return array.astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -188,12 +221,15 @@ class Preset:
         check_not_negative("core_radius", self.core, "or None for agent_radius")
         for name in ("margin", "least_way", "heading_range"):
             check_not_negative(name, getattr(self, name))
+        if self.arena > LARGEST:
+            raise ValueError(f"arena={self.arena!r} must be at most {LARGEST:g}")
         fewest, most = self.obstacle_count
-        if not 0 <= fewest <= most:
-            raise ValueError(f"obstacle_count={self.obstacle_count!r} must be 0 <= fewest <= most")
-        check_whole("agents", self.agents)
-        if self.layout not in ("random", "antipodal"):
-            raise ValueError(f'layout={self.layout!r} must be "random" or "antipodal"')
+        if not 0 <= fewest <= most <= MOST_OBSTACLES:
+            raise ValueError(
+                f"obstacle_count={self.obstacle_count!r} must be 0 <= fewest <= most <= "
+                f"{MOST_OBSTACLES}"
+            )
+        check_whole("agents", self.agents, 1, MOST_AGENTS)
 
     @property
     def core(self) -> float:
@@ -207,7 +243,7 @@ class Preset:
             ValueError: The number is less than 1.
         """
         count = self.agents if num_agents is None else num_agents
-        check_whole("num_agents", count)
+        check_whole("num_agents", count, 1, MOST_AGENTS)
         if not self.grows:
             return replace(self, agents=count)
         share = max(1.0, count / self.agents)
@@ -272,10 +308,10 @@ def preset_named(preset: str | Preset) -> Preset:
     """
     if isinstance(preset, Preset):
         return preset
-    if preset not in PRESETS:
+    if not isinstance(preset, str) or preset not in PRESETS:
         raise ValueError(
-            f"preset={preset!r} is not known; use one of {', '.join(PRESETS)}, or a "
-            "lagros_envs.scenarios.Preset"
+            f"preset={shown(preset)} is not known; use one of {', '.join(PRESETS)}, or a "
+            f"lagros_envs.scenarios.Preset{suggestion(preset, PRESETS)}"
         )
     return PRESETS[preset]
 
