@@ -191,16 +191,16 @@ def check_name(name: str, value: str, valid: Iterable[str]) -> None:
     """
     names = list(valid)
     known = isinstance(value, str) and value in names
-    _check(known, name, value, f"one of {', '.join(names)}{suggestion(value, names)}")
+    _check(known, name, value, f"one of {', '.join(names)}.{suggestion(value, names)}")
 
 
 def suggestion(given: Any, names: Iterable[str]) -> str:
-    """Return " (did you mean 'x'?)" where one of the names is close to the given one, else ""."""
+    """Return " Did you mean 'x'?" where one of the names is close to the given one, else ""."""
     # A long text is no slip of the keyboard, and comparing it takes long.
     if not isinstance(given, str) or len(given) > _SHOWN:
         return ""
     close = difflib.get_close_matches(given.lower(), list(names), n=1, cutoff=0.5)
-    return f" (did you mean {close[0]!r}?)" if close else ""
+    return f" Did you mean {close[0]!r}?" if close else ""
 
 
 def shown(value: object) -> str:

@@ -311,7 +311,7 @@ def preset_named(preset: str | Preset) -> Preset:
     if not isinstance(preset, str) or preset not in PRESETS:
         raise ValueError(
             f"preset={shown(preset)} is not known; use one of {', '.join(PRESETS)}, or a "
-            f"lagros_envs.scenarios.Preset{suggestion(preset, PRESETS)}"
+            f"lagros_envs.scenarios.Preset.{suggestion(preset, PRESETS)}"
         )
     return PRESETS[preset]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
-from lagros_envs.checks import check_fields, check_whole
+from lagros_envs.checks import check_fields, check_seed, check_whole
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_policies.contraction import (
@@ -56,6 +56,7 @@ class MetricDesignSettings:
     def __post_init__(self) -> None:
         """Check the numbers."""
         check_fields(self)
+        check_seed(self.seed)
         for name in ("plans", "pool", "checks"):
             check_whole(name, getattr(self, name))
 

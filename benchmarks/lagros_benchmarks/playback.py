@@ -25,7 +25,7 @@ from lagros_envs.checks import (
     check_whole,
 )
 from lagros_envs.disturbances import KINDS
-from lagros_envs.scenarios import PRESETS, Preset, Scenario, preset_named
+from lagros_envs.scenarios import MOST_AGENTS, PRESETS, Preset, Scenario, preset_named
 from lagros_envs.seeding import episode_streams
 
 TASKS = ("cartpole", "spacecraft")
@@ -82,7 +82,7 @@ class WatchSettings:
         if self.preset is not None and self.preset not in PRESETS:
             raise ValueError(unknown_name("preset", self.preset, PRESETS))
         if self.agents is not None:
-            check_whole("agents", self.agents)
+            check_whole("agents", self.agents, 1, MOST_AGENTS)
         check_seed(self.seed)
         if self.bound is not None:
             check_not_negative("bound", self.bound)

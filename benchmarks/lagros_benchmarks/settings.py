@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.util
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lagros_envs.checks import check_fields, check_not_negative, check_seed, check_whole
+from lagros_envs.checks import (
+    check_fields,
+    check_not_negative,
+    check_seed,
+    check_whole,
+    shown,
+    suggestion,
+)
 from lagros_envs.disturbances import KINDS
 from lagros_envs.seeding import EVALUATION, episode_seeds
 from lagros_policies.backends import LOKY, Backend
@@ -36,6 +43,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
 }
 # Bound of a comparison of numbers of agents, which has no use for a sweep over bounds.
 SCALE_BOUNDS = (0.4,)
+# What is kept of an episode lies in memory, and every job is a process.
+_MOST = {"episodes": 1_000_000, "jobs": 1024, "chunk": 1_000_000, "timing_episodes": 1_000_000}
 
 
 class Condition(NamedTuple):
@@ -66,12 +75,11 @@ class Case(NamedTuple):
     agents: int | None = None
 
 
-def unknown_name(what: str, given: str, valid: Iterable[str], note: str = "") -> str:
+def unknown_name(what: str, given: object, valid: Iterable[str], note: str = "") -> str:
     """Return the message for a name that is not known: a close match, then all valid names."""
     names = list(valid)
-    close = difflib.get_close_matches(given.lower(), names, n=1, cutoff=0.5)
-    hint = f" Did you mean {close[0]!r}?" if close else ""
-    return f"unknown {what} {given!r}.{hint} Valid: {', '.join(names)}{note}."
+    hint = suggestion(given, names)
+    return f"unknown {what} {shown(given)}.{hint} Valid: {', '.join(names)}{note}."
 
 
 def check_policy(name: str, task: str = "cartpole") -> None:
@@ -113,7 +121,7 @@ def check_task(task: str) -> None:
     Raises:
         ValueError: The task is unknown.
     """
-    if task not in TASKS:
+    if not isinstance(task, str) or task not in TASKS:
         raise ValueError(unknown_name("task", task, TASKS))
 
 
@@ -171,8 +179,9 @@ class BenchmarkSettings:
             values = getattr(self, name)
             if not values and not (name == "agents" and self.task == "cartpole"):
                 raise ValueError(f"{name} must not be empty")
-            if len(set(values)) != len(values):
-                raise ValueError(f"{name}={','.join(map(str, values))} names one of them twice")
+            twice = [value for value, count in Counter(values).items() if count > 1]
+            if twice:
+                raise ValueError(f"{name}={','.join(map(str, values))} names {twice[0]} twice")
         for kind in self.disturbances:
             if kind not in KINDS:
                 raise ValueError(unknown_name("disturbance", kind, KINDS))
@@ -180,8 +189,8 @@ class BenchmarkSettings:
             check_not_negative("bound", bound)
         if self.channels not in CHANNELS:
             raise ValueError(unknown_name("channels", self.channels, CHANNELS))
-        for name in ("episodes", "jobs", "chunk", "timing_episodes"):
-            check_whole(name, getattr(self, name))
+        for name, most in _MOST.items():
+            check_whole(name, getattr(self, name), 1, most)
         check_seed(self.seed)
         if self.task == "cartpole":
             self._check_alone()
@@ -200,14 +209,14 @@ class BenchmarkSettings:
                 )
 
     def _check_spacecraft(self) -> None:
-        from lagros_envs.scenarios import PRESETS
+        from lagros_envs.scenarios import MOST_AGENTS, PRESETS
 
         if self.preset not in PRESETS:
-            raise ValueError(unknown_name("preset", str(self.preset), PRESETS))
+            raise ValueError(unknown_name("preset", self.preset, PRESETS))
         if self.safety_filter not in SAFETY_FILTERS:
             raise ValueError(unknown_name("safety filter", self.safety_filter, SAFETY_FILTERS))
         for count in self.agents:
-            check_whole("agents", count)
+            check_whole("agents", count, 1, MOST_AGENTS)
         if "worst" in self.disturbances:
             raise ValueError(
                 "disturbance 'worst' pushes away from one nominal trajectory that all policies "

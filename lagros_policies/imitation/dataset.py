@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
-from lagros_envs.checks import check_fields, check_not_negative, check_whole
+from lagros_envs.checks import check_fields, check_not_negative, check_seed, check_whole
 from lagros_envs.disturbances import OPEN_LOOP, into_unit_ball
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
@@ -61,6 +61,7 @@ class ExpertDataSettings:
     def __post_init__(self) -> None:
         """Check the values."""
         check_fields(self)
+        check_seed(self.seed)
         if self.shards < 1 or self.plans % self.shards or self.samples % self.shards:
             raise ValueError(
                 f"shards={self.shards} must divide plans={self.plans} and samples={self.samples}"

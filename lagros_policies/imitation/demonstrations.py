@@ -18,7 +18,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_fields, check_not_negative, check_seed, check_whole
+from lagros_envs.checks import check_fields, check_name, check_not_negative, check_seed, check_whole
 from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.observation import global_state
 from lagros_envs.seeding import episode_seeds
@@ -31,6 +31,7 @@ Environment = gym.Env[Any, Any]
 
 # Identifier of the environment of each task, and the bound of its disturbance if none is given.
 ENVIRONMENTS = {"cartpole": "lagros/CartPole-v0", "spacecraft": "lagros/Spacecraft-v0"}
+MOST_EPISODES = 1_000_000  # all lie in memory
 DEFAULT_BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
 
 
@@ -59,9 +60,8 @@ class DemonstrationSettings:
     def __post_init__(self) -> None:
         """Check the values."""
         check_fields(self)
-        if self.task not in ENVIRONMENTS:
-            raise ValueError(f"task={self.task!r} must be one of {', '.join(ENVIRONMENTS)}")
-        check_whole("episodes", self.episodes)
+        check_name("task", self.task, ENVIRONMENTS)
+        check_whole("episodes", self.episodes, 1, MOST_EPISODES)
         check_seed(self.seed)
         if self.disturbance not in OPEN_LOOP:
             raise ValueError(

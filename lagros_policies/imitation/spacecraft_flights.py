@@ -21,11 +21,13 @@ from lagros_envs.checks import (
     check_above,
     check_each,
     check_fields,
+    check_name,
     check_not_negative,
+    check_seed,
     check_whole,
 )
 from lagros_envs.observation import Layout, observe
-from lagros_envs.scenarios import Preset, preset_named
+from lagros_envs.scenarios import MOST_AGENTS, PRESETS, Preset, preset_named
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.spacecraft_episode import SpacecraftEpisode
 from lagros_envs.spacecraft_task import SpacecraftSettings
@@ -84,7 +86,10 @@ class FlightSettings:
             raise ValueError(
                 f"worlds_per_shard={self.worlds_per_shard} must divide worlds={self.worlds}"
             )
-        check_each("agents", self.agents, 1)
+        check_seed(self.seed)
+        check_name("preset", self.preset, PRESETS)
+        check_each("agents", self.agents, 1, MOST_AGENTS)
+        check_each("sample_after", self.sample_after, 0)
         check_whole("sample_every", self.sample_every)
         check_not_negative("disturbance_bound", self.disturbance_bound)
         if not 0.0 <= self.open_share <= 1.0:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_each, check_fields, check_positive, check_whole
+from lagros_envs.checks import check_each, check_fields, check_positive, check_seed, check_whole
 from lagros_policies.imitation.fitting import Fit, IntArray, one_thread
 from lagros_policies.imitation.networks import Mlp
 
@@ -54,6 +54,7 @@ class TrainingSettings:
         check_each("hidden", self.hidden, 1)
         for name in ("epochs", "batch", "checkpoint_every"):
             check_whole(name, getattr(self, name))
+        check_seed(self.seed)
         check_positive("learning_rate", self.learning_rate)
         if not 0.0 < self.held_out < 1.0:
             raise ValueError(f"held_out={self.held_out!r} must be in (0, 1)")

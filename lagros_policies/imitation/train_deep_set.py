@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_each, check_fields, check_positive, check_whole
+from lagros_envs.checks import check_each, check_fields, check_positive, check_seed, check_whole
 from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_policies.imitation.deep_set import OUTPUTS, DeepSet
 from lagros_policies.imitation.fitting import Fit, IntArray, one_thread
@@ -70,6 +70,7 @@ class DeepSetTraining:
             check_each(name, getattr(self, name), 1)
         for name in ("epochs", "batch", "checkpoint_every"):
             check_whole(name, getattr(self, name))
+        check_seed(self.seed)
         for name in ("learning_rate", "outlier"):
             check_positive(name, getattr(self, name))
 

@@ -69,7 +69,7 @@ def test_a_table_without_episodes_is_refused_before_anything_is_made(
         monkeypatch.setattr(f"lagros_benchmarks.{name}", lambda *_: pytest.fail("it began"))
     result = invoke("reproduce", task, *options, "--jobs", "1")
     assert result.exit_code == 2
-    assert f"episodes={options[1]} must be at least 1" in result.stderr
+    assert f"episodes={options[1]} must be a whole number" in result.stderr
     assert not list(tmp_path.iterdir())
 
 

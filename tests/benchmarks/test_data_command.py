@@ -211,7 +211,7 @@ def test_an_export_that_breaks_off_leaves_nothing(tmp_path, monkeypatch):
     [
         ((), "name the format to write: pass --minari"),
         (("--minari", "--task", "cartpol"), "--task='cartpol' must be one of cartpole, spacecraft"),
-        (("--minari", "--episodes", "0"), "--episodes=0 must be at least 1"),
+        (("--minari", "--episodes", "0"), "--episodes=0 must be a whole number"),
         (("--minari", "--seed", "-1"), "--seed=-1 must be a non-negative integer"),
         (("--minari", "--disturbance", "worst"), "--disturbance='worst' must be one of none,"),
         (("--minari", "--bound", "-1"), "--bound=-1.0 must be finite and >= 0"),

@@ -267,7 +267,7 @@ def invoke(tmp_path, monkeypatch):
     [
         (("--preset", "papper"), "Did you mean 'paper'"),
         (("--agents", "6,six"), "--agents: 'six' is not a whole number"),
-        (("--agents", "0"), "agents=0 must be at least 1"),
+        (("--agents", "0"), "agents=0 must be a whole number"),
         (("--safety-filter", "yes"), "Valid: none, all, both"),
         (("--policies", "lqr"), "Valid: learned, tube-mpc, lagros, centralized"),
         (("--disturbance", "worst"), "'worst' pushes away"),

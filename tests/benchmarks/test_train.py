@@ -91,7 +91,7 @@ def test_every_default_can_be_built_and_written_down():
                 assert training.algorithm.buffer_size >= whole
     with pytest.raises(ValueError, match="Did you mean 'ppo'"):
         default_training("cartpole", "pppo")
-    with pytest.raises(ValueError, match="must be one of cartpole, spacecraft"):
+    with pytest.raises(ValueError, match="Valid: cartpole, spacecraft"):
         default_training("cartpoles", "ppo")
 
 

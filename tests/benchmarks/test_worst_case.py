@@ -160,7 +160,7 @@ def test_optimisers_are_reproducible_and_learn(name: str) -> None:
 def test_settings_name_what_is_wrong() -> None:
     with pytest.raises(ValueError, match="method='annealing' must be one of"):
         SearchSettings("annealing")
-    with pytest.raises(ValueError, match="population=1 must be at least 2"):
+    with pytest.raises(ValueError, match="population=1 must be a whole number"):
         SearchSettings(population=1)
     with pytest.raises(ValueError, match="goal='speed'"):
         AttackSettings(goal="speed")

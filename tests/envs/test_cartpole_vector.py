@@ -428,7 +428,7 @@ def test_step_before_reset_is_refused():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"num_envs": 0}, "num_envs=0 must be at least 1"),
+        ({"num_envs": 0}, "num_envs=0 must be a whole number"),
         ({"render_mode": "rgb_array"}, "does not draw"),
         ({"autoreset_mode": "later"}, "autoreset_mode='later' must be one of next_step"),
         ({"disturbance": "worst"}, "metric"),

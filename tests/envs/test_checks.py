@@ -147,7 +147,7 @@ def test_an_episode_of_no_step_or_of_too_many_is_no_multiple(value):
 def test_a_name_is_refused_with_the_valid_ones(value):
     with pytest.raises(ValueError, match=r"^kind=.+ must be one of none, gust") as error:
         checks.check_name("kind", value, ("none", "gust"))
-    assert ("did you mean 'gust'?" in str(error.value)) == (value == "gusts")
+    assert ("Did you mean 'gust'?" in str(error.value)) == (value == "gusts")
     checks.check_name("kind", "gust", ("none", "gust"))
 
 

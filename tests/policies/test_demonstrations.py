@@ -175,11 +175,11 @@ def test_the_record_says_which_metric_and_planner(run):
     ("wrong", "message"),
     [
         ({"task": "cartpol"}, "task='cartpol' must be one of cartpole, spacecraft"),
-        ({"episodes": 0}, "episodes=0 must be at least 1"),
+        ({"episodes": 0}, "episodes=0 must be a whole number"),
         ({"seed": -1}, "seed=-1 must be a non-negative integer"),
         ({"disturbance": "worst"}, "disturbance='worst' must be one of none, uniform"),
         ({"bound": -0.1}, "bound=-0.1 must be finite and >= 0"),
-        ({"bound": math.nan}, "bound=nan must be finite"),
+        ({"bound": math.nan}, "bound=nan must be a finite number"),
     ],
 )
 def test_a_wrong_setting_is_named_with_the_remedy(wrong, message):

@@ -6,16 +6,29 @@ beside its weights.
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, ClassVar
 
 from lagros_envs.cartpole_task import CartPoleSettings
-from lagros_envs.checks import check_fields, check_positive, check_whole
+from lagros_envs.checks import (
+    check_each,
+    check_fields,
+    check_name,
+    check_not_negative,
+    check_positive,
+    check_several,
+    check_whole,
+    shown,
+    suggestion,
+)
+from lagros_envs.disturbances import OPEN_LOOP
+from lagros_envs.scenarios import MOST_AGENTS, PRESETS
 from lagros_envs.seeding import EVALUATION
 
 # Segments are namespaces of their own in `lagros_envs.seeding`'s sense, far below `EVALUATION`.
 MOST_SEGMENTS = 1 << 16
+# Of what is counted, and the width of a layer: beyond are slips, and no memory holds them.
+MOST, MOST_WIDTH = 10**9, 1 << 16
 MOST_SEEDS = 1 << 32  # what stable-baselines3 and NumPy's old generator take
 # Namespaces of the held-out episodes of a learning curve and of those at its end ("curv" and "last"
 # in ASCII): neither training nor `lagros bench` ever meets them.
@@ -26,17 +39,28 @@ assert min(EVALUATION, CURVE, FINAL) >= MOST_SEGMENTS
 class _Ranged:
     """Settings whose ranges are checked when they are built."""
 
-    # Names of the attributes that must be finite and positive, and of those that count something.
+    # Names of the attributes that must be positive, that may also be zero, that are shares of one,
+    # that count something, and that are widths of layers.
     positive: ClassVar[tuple[str, ...]] = ()
+    not_negative: ClassVar[tuple[str, ...]] = ()
+    shares: ClassVar[tuple[str, ...]] = ()
     counts: ClassVar[tuple[str, ...]] = ()
+    widths: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
+        """Check types and ranges."""
         check_fields(self)
         for name in self.positive:
             check_positive(name, getattr(self, name))
+        for name in self.not_negative:
+            check_not_negative(name, getattr(self, name))
+        for name in self.shares:
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise ValueError(f"{name}={getattr(self, name)!r} must be in (0, 1]")
         for name in self.counts:
-            check_whole(name, getattr(self, name))
+            check_whole(name, getattr(self, name), 1, MOST)
+        for name in self.widths:
+            check_each(name, getattr(self, name), 1, MOST_WIDTH)
 
 
 @dataclass(frozen=True)
@@ -61,8 +85,10 @@ class Ppo(_Ranged):
     """
 
     name: ClassVar[str] = "ppo"
-    positive: ClassVar[tuple[str, ...]] = ("learning_rate", "discount", "clip_range")
+    positive: ClassVar[tuple[str, ...]] = ("learning_rate", "clip_range")
+    shares: ClassVar[tuple[str, ...]] = ("discount", "gae_decay")
     counts: ClassVar[tuple[str, ...]] = ("rollout_steps", "batch_size", "epochs")
+    widths: ClassVar[tuple[str, ...]] = ("hidden",)
     rollout_steps: int = 90
     batch_size: int = 1440
     epochs: int = 10
@@ -93,8 +119,11 @@ class OffPolicy(_Ranged):
     """
 
     name: ClassVar[str] = ""
-    positive: ClassVar[tuple[str, ...]] = ("learning_rate", "discount", "averaging")
+    positive: ClassVar[tuple[str, ...]] = ("learning_rate",)
+    not_negative: ClassVar[tuple[str, ...]] = ("warm_up",)
+    shares: ClassVar[tuple[str, ...]] = ("discount", "averaging")
     counts: ClassVar[tuple[str, ...]] = ("batch_size", "gradient_steps", "buffer_size")
+    widths: ClassVar[tuple[str, ...]] = ("hidden",)
     batch_size: int = 256
     gradient_steps: int = 2
     warm_up: int = 128
@@ -114,6 +143,7 @@ class Sac(OffPolicy):
     """
 
     name: ClassVar[str] = "sac"
+    positive: ClassVar[tuple[str, ...]] = (*OffPolicy.positive, "initial_entropy_weight")
     initial_entropy_weight: float = 0.1
 
 
@@ -127,6 +157,8 @@ class Td3(OffPolicy):
     """
 
     name: ClassVar[str] = "td3"
+    not_negative: ClassVar[tuple[str, ...]] = (*OffPolicy.not_negative, "action_noise")
+    counts: ClassVar[tuple[str, ...]] = (*OffPolicy.counts, "policy_delay")
     action_noise: float = 0.1
     policy_delay: int = 2
 
@@ -155,6 +187,7 @@ class Training(_Ranged):
     """
 
     task: ClassVar[str] = ""
+    not_negative: ClassVar[tuple[str, ...]] = ("effort_weight", "disturbance_bound")
     counts: ClassVar[tuple[str, ...]] = (
         "segments",
         "segment_steps",
@@ -176,8 +209,8 @@ class Training(_Ranged):
     def __post_init__(self) -> None:
         """Check the values."""
         super().__post_init__()
-        if not 0 <= self.seed < MOST_SEEDS:
-            raise ValueError(f"seed={self.seed!r} must be an integer from 0 to {MOST_SEEDS - 1}")
+        check_whole("seed", self.seed, 0, MOST_SEEDS - 1)
+        check_name("disturbance", self.disturbance, OPEN_LOOP)
         if self.segments >= MOST_SEGMENTS:
             raise ValueError(
                 f"segments={self.segments} must be below {MOST_SEGMENTS}; make segment_steps larger"
@@ -285,6 +318,13 @@ class SpacecraftTraining(Training):
         "first_share",
         "growth",
     )
+    not_negative: ClassVar[tuple[str, ...]] = (
+        *Training.not_negative,
+        "progress_weight",
+        "goal_weight",
+        "nearness_weight",
+        "obstacle_weight",
+    )
     counts: ClassVar[tuple[str, ...]] = (*Training.counts, "agents")
     algorithm: Algorithm = field(
         default_factory=lambda: Ppo(
@@ -318,6 +358,18 @@ class SpacecraftTraining(Training):
     final_bounds: tuple[float, ...] = (0.4,)
     final_presets: tuple[str, ...] = ("paper", "open")
 
+    def __post_init__(self) -> None:
+        """Check the values."""
+        super().__post_init__()
+        for preset in (self.preset, *self.final_presets):
+            check_name("preset", preset, PRESETS)
+        check_each("final_agents", self.final_agents, 1, MOST_AGENTS)
+        check_whole("agents", self.agents, 1, MOST_AGENTS)
+        for name in ("final_bounds", "final_presets"):
+            check_several(name, getattr(self, name), "a tuple with something in it")
+        for bound in self.final_bounds:
+            check_not_negative("final_bounds", bound)
+
     @property
     def rows(self) -> int:
         """Agents that learn side by side."""
@@ -343,12 +395,12 @@ def default_training(task: str, algorithm: str) -> Training:
         ValueError: There are none.
     """
     if task not in DEFAULTS:
-        raise ValueError(f"task={task!r} must be one of {', '.join(DEFAULTS)}")
+        hint = suggestion(task, DEFAULTS)
+        raise ValueError(f"unknown task {shown(task)}.{hint} Valid: {', '.join(DEFAULTS)}.")
     known = DEFAULTS[task]
     if algorithm not in known:
-        close = difflib.get_close_matches(algorithm.lower(), known, n=1)
-        hint = f" Did you mean {close[0]!r}?" if close else ""
         raise ValueError(
-            f"--algo {algorithm!r} is not known for {task}.{hint} Use one of {', '.join(known)}"
+            f"--algo {shown(algorithm)} is not known for {task}.{suggestion(algorithm, known)} "
+            f"Use one of {', '.join(known)}"
         )
     return known[algorithm]

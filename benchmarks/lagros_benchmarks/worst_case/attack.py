@@ -38,7 +38,7 @@ from lagros_benchmarks.worst_case.replay import (
     replay_cartpole,
     replay_spacecraft,
 )
-from lagros_benchmarks.worst_case.search import Found, SearchSettings, search
+from lagros_benchmarks.worst_case.search import MOST, Found, SearchSettings, search
 from lagros_benchmarks.worst_case.seeds import ATTACK
 from lagros_benchmarks.worst_case.sequences import Replay
 from lagros_benchmarks.worst_case.spacecraft import (
@@ -47,8 +47,9 @@ from lagros_benchmarks.worst_case.spacecraft import (
     first_adversaries,
 )
 from lagros_envs import spacecraft_task
-from lagros_envs.checks import check_fields, check_positive, check_seed, check_whole
+from lagros_envs.checks import check_fields, check_name, check_positive, check_seed, check_whole
 from lagros_envs.disturbances import Disturbance
+from lagros_envs.scenarios import MOST_AGENTS, PRESETS
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
 from lagros_policies.expert import CartPoleExpert
@@ -104,11 +105,11 @@ class AttackSettings:
         check_fields(self)
         check_task(self.task)
         check_policy(self.policy, self.task)
-        if self.goal not in GOALS:
-            raise ValueError(f"goal={self.goal!r} must be one of {', '.join(GOALS)}")
+        check_name("goal", self.goal, GOALS)
+        check_name("preset", self.preset, PRESETS)
         check_positive("bound", self.bound)
-        for name in ("episodes", "agents"):
-            check_whole(name, getattr(self, name))
+        check_whole("episodes", self.episodes, 1, MOST)
+        check_whole("agents", self.agents, 1, MOST_AGENTS)
         check_seed(self.seed)
         if self.safety_filter and self.task == "cartpole":
             raise ValueError("safety_filter=True is for the task spacecraft; leave it out")

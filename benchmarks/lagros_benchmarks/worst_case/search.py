@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from lagros_benchmarks.worst_case.optimisers import OPTIMISERS, make_search
 from lagros_benchmarks.worst_case.sequences import PARAMETRISATIONS, Parametrisation
-from lagros_envs.checks import check_fields, check_whole
+from lagros_envs.checks import check_fields, check_name, check_whole
 from lagros_envs.disturbances import into_unit_ball, onto_unit_sphere
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
+MOST = 10**9  # of all that is counted
 METHODS = (*OPTIMISERS, "gradient", "hybrid")
 # Shares of the way to the pushes that the slopes ask for, tried side by side.
 _WAYS = (1.0, 0.5, 0.2, 0.05)
@@ -93,12 +94,9 @@ class SearchSettings:
             ("optimiser", OPTIMISERS),
             ("parametrisation", tuple(PARAMETRISATIONS)),
         ):
-            if getattr(self, name) not in valid:
-                raise ValueError(
-                    f"{name}={getattr(self, name)!r} must be one of {', '.join(valid)}"
-                )
+            check_name(name, getattr(self, name), valid)
         for name, least in (("pieces", 1), ("budget", 1), ("population", 2), ("restarts", 1)):
-            check_whole(name, getattr(self, name), least)
+            check_whole(name, getattr(self, name), least, MOST)
 
 
 @dataclass(frozen=True)
