@@ -128,7 +128,7 @@ def make(name: str, env: Any, allow_wrappers: bool = False, **settings: Any) -> 
     else:
         classes = _CARTPOLE
     if name in classes:
-        return _built(_shipped_class(name, classes[name]), task, world, settings)
+        return _shipped(name, classes[name], task, world, settings)
     if name.endswith(".zip"):
         from lagros_policies.sb3_model import load_stable_baselines3
 
@@ -152,10 +152,10 @@ def _built(
     return policy(task, **settings)
 
 
-def _shipped_class(name: str, place: str) -> Callable[..., Policy]:
+def _shipped(name: str, place: str, task: Any, world: Any, settings: dict[str, Any]) -> Policy:
     module, _, attribute = place.partition(":")
     try:
-        return cast("Callable[..., Policy]", getattr(importlib.import_module(module), attribute))
+        return _built(getattr(importlib.import_module(module), attribute), task, world, settings)
     except ModuleNotFoundError as error:
         raise ImportError(
             f"policy {name!r} needs {error.name}, which is not installed: "

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lagros_benchmarks.extras import check_extra
 from lagros_benchmarks.outputs import Delivery, check_outputs, policy_files
 from lagros_benchmarks.terminal import fail, find_users_modules
 
@@ -118,6 +119,8 @@ def _settings(
         raise ValueError(
             f"--method {method}: the spacecraft has one search only; leave --method out"
         )
+    if method == "cma":
+        check_extra("--method cma", "attack")
     flights = BUDGETS[task] if budget is None else budget
     population = 30 if task == "cartpole" else 16
     return AttackSettings(

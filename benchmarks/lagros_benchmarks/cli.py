@@ -15,6 +15,7 @@ from lagros_benchmarks.attack import attack
 from lagros_benchmarks.certify import certify
 from lagros_benchmarks.data import data
 from lagros_benchmarks.export import export
+from lagros_benchmarks.extras import check_extra
 from lagros_benchmarks.outputs import policy_files
 from lagros_benchmarks.terminal import (
     Commands,
@@ -225,6 +226,8 @@ def reproduce(
     place = folder or Path(f"runs/reproduce-{task}")
     try:
         check_task(task)
+        if not shipped:
+            check_extra("lagros reproduce", "train")
         workers = Backend(backend, address)
         wanted = _reproduction(task, episodes, jobs, workers)
         outputs = _reproduced(task, place)
@@ -237,7 +240,7 @@ def reproduce(
             )
     except ValueError as error:
         fail(error)
-    except BackendError as error:
+    except (ImportError, BackendError) as error:
         fail(error, status=1)
     run_and_report(benchmark, outputs)
 

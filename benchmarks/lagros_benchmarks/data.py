@@ -5,7 +5,6 @@ Only the standard library, typer and `terminal` are imported here; the commands 
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import tempfile
 import warnings
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lagros_benchmarks.extras import check_extra
 from lagros_benchmarks.terminal import fail, progress_bar
 
 if TYPE_CHECKING:
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 # Where Minari looks for its datasets.
 DATASETS_PATH = "MINARI_DATASETS_PATH"
-# What writing needs beyond lagros[policies]: Minari, and the two packages behind its format Arrow.
-_PACKAGES = ("minari", "pyarrow", "PIL")
 _ALGORITHMS = {
     "cartpole": "CV-STEM tube MPC: one plan, tracked with u*",
     "spacecraft": "centralised planner of one agent, tracked with u*",
@@ -66,12 +64,10 @@ def export(
     """Fly the expert and write its episodes, with the record of metric and planner."""
     if not minari:
         fail("name the format to write: pass --minari")
-    missing = missing_packages()
-    if missing:
-        fail(
-            f"--minari needs {', '.join(missing)}: install it with pip install 'lagros[data]'",
-            status=1,
-        )
+    try:
+        check_extra("--minari", "data")
+    except ImportError as error:
+        fail(error, status=1)
     from lagros_policies.imitation.demonstrations import DemonstrationSettings, demonstrate
 
     try:
@@ -97,11 +93,6 @@ def export(
 def dataset_id(task: str) -> str:
     """Return the identifier of a task's dataset, as Minari takes it."""
     return f"lagros/{task}/expert-v0"
-
-
-def missing_packages() -> list[str]:
-    """Return the packages behind --minari that are not installed."""
-    return [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
 
 
 def check_free(folder: Path, identifier: str) -> None:

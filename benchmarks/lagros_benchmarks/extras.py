@@ -5,6 +5,8 @@ Only the standard library is imported here: it must work where nothing else is i
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 # The packages of each extra that the command line may ask for, by the name of their import. Of two
 # extras that hold one package, the first is named: the command line is there already.
 MODULES = {
@@ -21,6 +23,22 @@ MODULES = {
     "dask": ("distributed", "joblib"),
     "fast": ("numba",),
 }
+
+
+def check_extra(what: str, extra: str, *modules: str) -> None:
+    """Check, before any work is done, that what it will need in the end is installed.
+
+    Args:
+        what: Who needs it, as the message names it.
+        extra: A key of `MODULES`.
+        modules: Those of its packages that are needed; all if none is named.
+
+    Raises:
+        ImportError: One is missing.
+    """
+    missing = [module for module in modules or MODULES[extra] if find_spec(module) is None]
+    if missing:
+        raise ImportError(f"{what} needs {', '.join(missing)}: pip install 'lagros[{extra}]'")
 
 
 def install_hint(error: BaseException) -> str:

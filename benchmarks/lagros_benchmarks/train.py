@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from lagros_benchmarks.extras import check_extra
 from lagros_benchmarks.outputs import Delivery, check_outputs
 from lagros_benchmarks.terminal import fail, listed
 
@@ -126,12 +127,7 @@ def _train_one(
     tensorboard: bool,
     parallel_env: bool,
 ) -> dict[str, Any]:
-    try:
-        import stable_baselines3  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            "lagros train needs stable-baselines3: pip install 'lagros[rl]'"
-        ) from error
+    check_extra("lagros train", "rl", "stable_baselines3")
     import torch
     from rich.console import Console
 

@@ -223,10 +223,3 @@ def test_a_mistake_is_explained_with_status_2_before_any_flight(grounded, argume
     assert result.exit_code == 2
     assert message in result.stderr
     assert isinstance(result.exception, SystemExit)
-
-
-def test_without_minari_the_extra_is_named(monkeypatch, grounded):
-    monkeypatch.setattr(data, "missing_packages", lambda: ["minari"])
-    result = export("--minari")
-    assert result.exit_code == 1
-    assert "--minari needs minari: install it with pip install 'lagros[data]'" in result.stderr

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import json
+import os
 import re
 import subprocess
 import sys
@@ -14,6 +16,7 @@ from typer.testing import CliRunner
 
 from lagros_benchmarks import cli, library
 from lagros_benchmarks.extras import MODULES, install_hint
+from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
 from tests.benchmarks import fakes
 
 ROOT = Path(__file__).parents[2]
@@ -71,22 +74,129 @@ def test_the_extra_all_holds_every_extra_but_the_peers(project):
     assert set(re.findall(r"[a-z0-9]+", line.partition("[")[2])) == set(extras) - {"all", "speed"}
 
 
-def without(module, *arguments):
-    """Run the command in a process in which a package cannot be imported."""
-    code = f"""
-import sys
+def absent(modules):
+    """The head of a script in which these packages are not installed."""
+    return f"""
+import json, sys
+from importlib.machinery import PathFinder
 
-class Absent:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] == {module!r}:
-            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+found = PathFinder.find_spec
 
-sys.meta_path.insert(0, Absent())
-sys.argv = ["lagros", *{arguments!r}]
-from lagros_benchmarks.__main__ import main
-main()
+def find_spec(name, path=None, target=None):
+    return None if name.partition(".")[0] in {set(modules)!r} else found(name, path, target)
+
+PathFinder.find_spec = find_spec
 """
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+def python(code, folder=None):
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def with_extra_alone(project, extra):
+    """The packages of the table that an extra, with those that it names, does not bring."""
+    extras = project["optional-dependencies"]
+    names, todo = set(), [extra]
+    while todo:
+        names.add(todo.pop())
+        lines = " ".join(line for name in names for line in extras[name])
+        todo += set(re.findall(r"[a-z]+", " ".join(re.findall(r"lagros\[(.*?)\]", lines)))) - names
+    brought = set().union(*(required(extras[name]) for name in names))
+    return {module for modules in MODULES.values() for module in modules} - brought
+
+
+def outcomes(project, commands, folder):
+    """Exit status and words of commands, with `lagros[bench]` alone, in one process."""
+    code = f"""{absent(with_extra_alone(project, "bench"))}
+from typer.testing import CliRunner
+from lagros_benchmarks import cli
+
+for arguments in {[arguments.split() for arguments in commands]!r}:
+    result = CliRunner().invoke(cli.app, arguments)
+    print(json.dumps([result.exit_code, result.stderr, repr(result.exception)]))
+"""
+    result = python(code, folder)
+    assert result.returncode == 0, result.stderr
+    return [json.loads(line) for line in result.stdout.splitlines()]
+
+
+@pytest.mark.slow
+def test_the_extra_of_the_command_line_flies_draws_and_certifies(project, tmp_path):
+    commands = [
+        f"bench cartpole --episodes 1 --timing-episodes 1 --policies {','.join(NAMES)} --jobs 2",
+        "bench spacecraft --episodes 1 --timing-episodes 1 --agents 2 --bound 0.4 "
+        "--policies lagros --figure a.png --scene b.svg --json c.json",
+        "watch cartpole --seconds 0.5 --video d.gif",
+        *(
+            f"watch spacecraft --policy {name} --agents 2 --seconds 0.5 --video {name}.gif"
+            for name in SPACECRAFT_NAMES
+        ),
+        "watch spacecraft --agents 2 --seconds 0.5 --safety-filter --video e.gif",
+        "attack cartpole --episodes 1 --budget 60 --npz f.npz",
+        "certify spacecraft --episodes 0",
+        "export learned-cartpole --out g.c",
+        "export lagros-cartpole --format onnx --out h.onnx",
+    ]
+    found = outcomes(project, commands, tmp_path)
+    assert len(found) == len(commands)
+    for command, (status, words, exception) in zip(commands, found, strict=True):
+        assert status == 0, f"{command}: {words} {exception}"
+    assert {path.suffix for path in tmp_path.iterdir()} >= {".png", ".svg", ".gif", ".npz", ".c"}
+
+
+def test_what_needs_another_extra_names_it_before_it_works(project, tmp_path):
+    needs = {
+        "train cartpole --segments 1": "rl",
+        "train spacecraft --segments 1": "rl",
+        "reproduce cartpole": "train",
+        "reproduce spacecraft": "train",
+        "data export --minari": "data",
+        "attack cartpole --method cma": "attack",
+        "watch cartpole --policy lqr --video a.mp4": "video",
+        "bench cartpole --episodes 1 --backend ray": "ray",
+        "bench cartpole --episodes 1 --backend dask": "dask",
+        "reproduce cartpole --shipped-weights --episodes 1 --backend ray": "ray",
+    }
+    found = outcomes(project, needs, tmp_path)
+    for (command, extra), (status, words, exception) in zip(needs.items(), found, strict=True):
+        assert status == 1, f"{command}: {words} {exception}"
+        assert exception == "SystemExit(1)", command
+        assert f"pip install 'lagros[{extra}]'" in words.replace('"', "'"), command
+        assert len(words.strip().splitlines()) == 1, words
+    assert list(tmp_path.glob("**/*.*")) == []
+
+
+def test_every_policy_names_the_extra_that_flies_it(project):
+    code = f"""{absent(MODULES["policies"])}
+import gymnasium, lagros_envs, lagros_policies
+from lagros_envs import spacecraft_v0
+from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
+
+for env, names in (
+    (gymnasium.make("lagros/CartPole-v0"), NAMES),
+    (spacecraft_v0.parallel_env(num_agents=2), SPACECRAFT_NAMES),
+):
+    for name in names:
+        try:
+            lagros_policies.make(name, env)
+        except ImportError as error:
+            print(name, "pip install 'lagros[policies]'" in str(error))
+        else:
+            print(name, "needs nothing")
+"""
+    result = python(code)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.split("\n")[:-1] == [
+        *(f"{name} {'needs nothing' if name == 'random' else 'True'}" for name in NAMES),
+        *(f"{name} True" for name in SPACECRAFT_NAMES),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -98,7 +208,12 @@ main()
     ],
 )
 def test_a_command_without_its_extra_says_what_to_install(module, arguments, extra):
-    result = without(module, *arguments)
+    code = f"""{absent([module])}
+sys.argv = ["lagros", *{arguments!r}]
+from lagros_benchmarks.__main__ import main
+main()
+"""
+    result = python(code)
     assert result.returncode == 1
     assert f"pip install 'lagros[{extra}]' brings {module}" in result.stderr
     assert "Traceback" not in result.stderr
