@@ -11,8 +11,9 @@ import gymnasium as gym
 import numpy as np
 
 import lagros_envs  # noqa: F401  (registers the environments, in worker processes too)
-from lagros_benchmarks.episodes import EpisodeRecord, describe_error, run_episode, timed_action
+from lagros_benchmarks.episodes import ACTION, EpisodeRecord, run_episode
 from lagros_benchmarks.experiment import BenchmarkRun
+from lagros_benchmarks.flying import rehearse
 from lagros_benchmarks.library import (
     BareNetwork,
     Environment,
@@ -20,6 +21,8 @@ from lagros_benchmarks.library import (
     Policy,
     SetupError,
     Toolbox,
+    building,
+    describe_error,
 )
 from lagros_benchmarks.settings import BenchmarkSettings, Case, Condition
 from lagros_benchmarks.workers import Progress, gather, split
@@ -81,22 +84,20 @@ class CartPoleExperiment:
         """Build everything once, so that a damaged file ends the run before it has begun.
 
         Raises:
-            SetupError: Something cannot be built.
+            SetupError: Something cannot be built, or cannot run.
         """
         env = make_environment(settings, toolbox, _CALM)
         task = env.get_wrapper_attr("settings")
         times = task.control_period * np.arange(task.steps + 1)
-        building = "the planner"
-        try:
+        with building("the planner"):
             toolbox.make_planner()
-            building = "the contraction metric"
+        with building("the contraction metric"):
             toolbox.load_metric(settings.metric)
-            forward_times = {}
-            for name in settings.policies:
-                building = f"policy {name!r}"
-                forward_times[name] = forward_time(make_policy(settings, toolbox, name, env))
-        except Exception as error:
-            raise SetupError.building(building, error) from error
+        forward_times = {}
+        for name in settings.policies:
+            policy = make_policy(settings, toolbox, name, env)
+            with building(f"policy {name!r}"):
+                forward_times[name] = forward_time(policy)
         return cls(
             settings=settings,
             toolbox=toolbox,
@@ -171,14 +172,15 @@ def make_environment(
 def make_policy(
     settings: BenchmarkSettings, toolbox: Toolbox, name: str, env: Environment
 ) -> Policy:
-    """Build a policy and call it once, so that what its first call loads is not timed."""
-    policy = toolbox.make_policy(name, env, settings.policy_settings.get(name, {}))
+    """Build a policy and call it once, so that what its first call loads is not timed.
+
+    Raises:
+        SetupError: It cannot be built, or cannot run.
+    """
+    with building(f"policy {name!r}"):
+        policy = toolbox.make_policy(name, env, settings.policy_settings.get(name, {}))
     observation, _ = env.reset(seed=0, options=_standing_still(env))
-    # An exception is the episodes' business, where it is written down.
-    try:
-        timed_action(policy, observation, None, first=True)
-    except Exception:
-        return policy
+    rehearse(f"policy {name!r}", policy, observation, [True], ACTION)
     return policy
 
 
@@ -218,6 +220,8 @@ def _plan_chunk(
         env.reset(seed=seed)
         try:
             plan = planner.plan(env.scenario.initial_state, env.scenario.goal)
+        except ImportError as error:  # of a solver: no plan would be worth anything
+            raise SetupError.building("the planner", error) from error
         except Exception as error:
             plans.append(NominalPlan(seed, None, float("nan"), describe_error(error)))
             continue

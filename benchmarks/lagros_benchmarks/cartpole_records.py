@@ -34,7 +34,8 @@ def rows(run: CartPoleRun) -> list[Row]:
             **_efforts(records),
             **_times(run, case),
             **_tracking(run, case),
-            "counters": added_up(record.counters for record in records),
+            "counters": added_up({**r.counters, **r.timed_counters} for r in records),
+            "raised": sum(record.error is not None for record in records),
             "errors": [{"seed": r.seed, "text": r.error} for r in records if r.error is not None],
             "versus": _versus(run, case),
         }
@@ -47,6 +48,7 @@ def episode_objects(run: CartPoleRun) -> Iterable[dict[str, Any]]:
     for records in run.episodes.values():
         for record in records:
             fields = asdict(record)
+            fields["counters"] |= fields.pop("timed_counters")
             times = step_time_statistics(fields.pop("step_times"), record.deadline_misses)
             yield {**fields, "step_time_median_s": times.median, "step_time_max_s": times.maximum}
 

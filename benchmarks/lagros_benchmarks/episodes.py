@@ -5,21 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_benchmarks.flying import Attempt, ask, counted, reseed
 from lagros_benchmarks.library import Environment, FloatArray, Policy
-from lagros_envs.seeding import episode_streams
 
 # Both tubes begin with radius zero, where a plan's rounding must not count as leaving them. The
 # planner promises its plans to the same accuracy.
 TUBE_TOLERANCE = 1e-6
 
-_FIRST_STEP: NDArray[np.bool_] = np.array([True])
-_LATER_STEP: NDArray[np.bool_] = np.array([False])
+# Shape of the action.
+ACTION = (1,)
+# What a policy counts by the clock, which is another number every time.
+TIMED_COUNTERS = ("late_plans",)
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class EpisodeRecord:
             (`claims`).
         max_tracking_error: The largest ||x - x_d||; None without a plan.
         counters: What the policy counts, summed over the episode.
+        timed_counters: Those of them that depend on the clock; left out of the comparison.
         error: The exception that ended the episode, which is then a failure; None if none did.
         tracking_error: ||x - x_d|| at every control instant; nan after an early end.
         step_times: Time of each call of `predict` [s].
@@ -66,6 +67,7 @@ class EpisodeRecord:
     max_tracking_error: float | None
     counters: dict[str, int]
     error: str | None
+    timed_counters: dict[str, int] = field(compare=False)
     tracking_error: FloatArray = field(compare=False, repr=False)
     step_times: FloatArray = field(compare=False, repr=False)
     deadline_misses: int = field(compare=False)
@@ -78,6 +80,7 @@ class _Trace:
     info: dict[str, Any] = field(default_factory=dict)
     errors: list[float] = field(default_factory=list)
     step_times: list[float] = field(default_factory=list)
+    state: Any = None
     counters: dict[str, int] = field(default_factory=dict)
     reached_limit: bool = False
 
@@ -90,11 +93,6 @@ class _Trace:
             self.errors.append(math.inf if math.isnan(error) else error)
 
 
-def describe_error(error: BaseException) -> str:
-    """Return the type and the text of an exception on one line."""
-    return f"{type(error).__name__}: {error}".replace("\n", " ")
-
-
 def added_up(counters: Iterable[Mapping[str, int]]) -> dict[str, int]:
     """Return the sums of what several episodes have counted, by name; zeros are kept."""
     total: dict[str, int] = {}
@@ -102,22 +100,6 @@ def added_up(counters: Iterable[Mapping[str, int]]) -> dict[str, int]:
         for name, count in counts.items():
             total[name] = total.get(name, 0) + count
     return total
-
-
-def timed_action(
-    policy: Policy, observation: Any, state: Any, first: bool
-) -> tuple[NDArray[np.float32], Any, float]:
-    """Ask the policy for one action.
-
-    Returns:
-        The action, the policy's state, and the time [s] of the call with the conversion of its
-        result to what the environment takes.
-    """
-    episode_start = _FIRST_STEP if first else _LATER_STEP
-    begin = perf_counter()
-    action, state = policy.predict(observation, state, episode_start, True)
-    action = np.asarray(action, dtype=np.float32)
-    return action, state, perf_counter() - begin
 
 
 def run_episode(
@@ -144,40 +126,31 @@ def run_episode(
         The record of the episode.
     """
     trace = _Trace()
-    problem: str | None = None
-    try:
+    with Attempt() as attempt:
         _play(env, policy, seed, nominal, trace)
-    except Exception as error:
-        problem = describe_error(error)
+    # A planner's count of failed plans matters most in the episode that raised.
+    with Attempt() as counting:
+        trace.counters = counted(policy, trace.state)
     name = label or str(getattr(policy, "name", policy))
-    return _record(env, name, seed, trace, problem)
+    return _record(env, name, seed, trace, attempt.error or counting.error)
 
 
 def _play(
     env: Environment, policy: Policy, seed: int, nominal: FloatArray | None, trace: _Trace
 ) -> None:
-    reseed = getattr(policy, "reseed", None)
-    if reseed is not None:
-        reseed(episode_streams(seed).policy)
+    reseed(policy, seed)
     options = {} if nominal is None else {"nominal": nominal}
     # The observation of the cart-pole is all that there is: local and global are the same.
     observation, info = env.reset(seed=seed, options=options)
     trace.note(info)
-    state: Any = None
     terminated = truncated = False
-    try:
-        while not (terminated or truncated):
-            first = not trace.step_times
-            action, state, elapsed = timed_action(policy, observation, state, first)
-            trace.step_times.append(elapsed)
-            observation, _, terminated, truncated, info = env.step(action)
-            trace.note(info)
-        trace.reached_limit = truncated and not terminated
-    finally:
-        # A planner's count of failed plans matters most in the episode that raised.
-        counters = getattr(policy, "counters", None)
-        if counters is not None and state is not None:
-            trace.counters = {str(key): int(value) for key, value in counters(state).items()}
+    while not (terminated or truncated):
+        first = not trace.step_times
+        action, trace.state, seconds = ask(policy, observation, trace.state, [first], ACTION)
+        trace.step_times.append(seconds)
+        observation, _, terminated, truncated, info = env.step(action)
+        trace.note(info)
+    trace.reached_limit = truncated and not terminated
 
 
 def _record(
@@ -211,8 +184,9 @@ def _record(
         left_paper_tube=fallen or _left(errors, np.asarray(world.settings.tube.radius(times))),
         left_certified_tube=None,
         max_tracking_error=max(trace.errors) if trace.errors else None,
-        counters=trace.counters,
+        counters={n: count for n, count in trace.counters.items() if n not in TIMED_COUNTERS},
         error=problem,
+        timed_counters={n: count for n, count in trace.counters.items() if n in TIMED_COUNTERS},
         tracking_error=errors,
         step_times=step_times,
         deadline_misses=int(np.count_nonzero(step_times > period)),

@@ -6,7 +6,8 @@ imports only what its chunk needs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -19,22 +20,54 @@ from lagros_benchmarks.claims import position_margin
 FloatArray = NDArray[np.float64]
 Environment = gym.Env[Any, Any]
 
+_LONGEST_TEXT = 500
+
+
+def describe_error(error: BaseException) -> str:
+    """Return the type and the text of an exception on one line that any terminal can print."""
+    try:
+        text = str(error)
+    except Exception:  # __str__ is the stranger's, too
+        text = "(its text cannot be read)"
+    text = " ".join(text.encode("utf-8", "backslashreplace").decode().split())
+    text = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
+    if len(text) > _LONGEST_TEXT:
+        text = f"{text[:_LONGEST_TEXT]}…"
+    return f"{type(error).__name__}: {text}"
+
 
 class SetupError(Exception):
-    """A run cannot begin: a policy, the planner or the metric cannot be built."""
+    """A run cannot begin: a policy, the planner or the metric cannot be built, or cannot run."""
 
     @classmethod
-    def building(cls, what: str, error: Exception) -> SetupError:
+    def building(cls, what: str, error: BaseException) -> SetupError:
         """Return the error of something that cannot be built; its name is said once.
 
         Args:
             what: What was built, "policy 'mine:Lean'" for instance.
             error: What that has raised.
         """
-        text = str(error) if isinstance(error, ValueError) else ""
-        if not text.startswith(what):
-            text = f"{what} cannot be built: {type(error).__name__}: {error}"
-        return cls(text.replace("\n", " "))
+        text = describe_error(error)
+        own = text.partition(": ")[2] if isinstance(error, ValueError) else ""
+        return cls(own if own.startswith(what) else f"{what} cannot be built: {text}")
+
+
+@contextmanager
+def building(what: str) -> Iterator[None]:
+    """Turn whatever the constructor of a stranger raises, SystemExit too, into a `SetupError`.
+
+    Args:
+        what: As for `SetupError.building`.
+
+    Raises:
+        SetupError: Something was raised.
+    """
+    try:
+        yield
+    except (KeyboardInterrupt, SetupError):
+        raise
+    except BaseException as error:
+        raise SetupError.building(what, error) from error
 
 
 class Policy(Protocol):
@@ -115,11 +148,10 @@ def make_single_policy(name: str, env: Any) -> Policy:
     """
     try:
         return make_policy(name, env, {})
-    except (ValueError, OSError, ImportError):
+    except (ValueError, OSError, ImportError, KeyboardInterrupt):
         raise
-    except Exception as error:
-        text = f"policy {name!r} cannot be built: {type(error).__name__}: {error}"
-        raise SetupError(text) from error
+    except BaseException as error:
+        raise SetupError.building(f"policy {name!r}", error) from error
 
 
 def make_filter(policy: Any, env: Any, disturbance_bound: float) -> Policy:

@@ -14,7 +14,10 @@ import numpy as np
 
 import lagros_envs  # noqa: F401  (registers the environments)
 from lagros_benchmarks import library
+from lagros_benchmarks.episodes import ACTION
+from lagros_benchmarks.flying import Attempt, ask, check_interface, counted, rehearse, reseed
 from lagros_benchmarks.settings import unknown_name
+from lagros_benchmarks.spacecraft_episodes import is_global, shapes_of
 from lagros_benchmarks.video import FRAME_RATES, Frame, check_video_path, video_bytes
 from lagros_envs import spacecraft_v0
 from lagros_envs.checks import (
@@ -26,7 +29,6 @@ from lagros_envs.checks import (
 )
 from lagros_envs.disturbances import KINDS
 from lagros_envs.scenarios import MOST_AGENTS, PRESETS, Preset, Scenario, preset_named
-from lagros_envs.seeding import episode_streams
 
 TASKS = ("cartpole", "spacecraft")
 BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
@@ -106,6 +108,8 @@ class WatchSettings:
 class Playback:
     """An environment and a policy in it, ready to play one episode.
 
+    What the policy raises ends the episode as a failure; what was flown until then is shown.
+
     Args:
         settings: What to watch.
 
@@ -113,7 +117,7 @@ class Playback:
         ValueError: The policy's name is unknown, or the scenario is not valid or does not fit.
         OSError: The scenario cannot be read, or the policy has no weights.
         ImportError: An extra that the policy needs is not installed.
-        SetupError: The constructor of a class of the user's own raises.
+        SetupError: The constructor of a class of the user's own raises, or it cannot run.
     """
 
     def __init__(self, settings: WatchSettings) -> None:
@@ -158,6 +162,11 @@ class Playback:
         self._show()
         return None
 
+    @property
+    def error(self) -> str | None:
+        """What the policy raised; None if nothing."""
+        return self._game.error
+
     def close(self) -> None:
         """Close the window, if there is one."""
         self._game.env.close()
@@ -172,9 +181,13 @@ class Playback:
         if settings.disturbance != "none":
             title += f" d̄ = {settings.disturbance_bound:g}"
         lines = [f"{title}: {self._game.outcome()}"]
-        counts = self._game.counters()
+        counts: dict[str, int] = {}
+        with Attempt():
+            counts = self._game.counters()
         if counts:
             lines.append(", ".join(f"{name} {count}" for name, count in counts.items()))
+        if self.error is not None:
+            lines.append(f"the policy raised, which counts as a failure: {self.error}")
         return lines
 
     def _drawn(self) -> Iterator[Frame]:
@@ -224,36 +237,46 @@ class _CartPoleGame:
             disable_env_checker=True,
         ).unwrapped
         self._policy: Any = library.make_single_policy(settings.policy, self.env)
+        # On an environment without a window, which would stand still while this plans.
+        self._planned: Any = gym.make("lagros/CartPole-v0", disable_env_checker=True).unwrapped
+        seen, _ = self._planned.reset(seed=settings.seed)
+        rehearse(f"policy {settings.policy!r}", self._policy, seen, [True], ACTION)
+        self.error: str | None = None
         self._state: Any = None
         self._info: dict[str, Any] = {}
         self._observation: Any = None
         self._first = True
 
     def start(self) -> None:
-        _reseed(self._policy, self._seed)
-        # On an environment without a window, which would stand still while this plans.
-        planned: Any = gym.make("lagros/CartPole-v0", disable_env_checker=True).unwrapped
-        planned.reset(seed=self._seed)
-        scenario = planned.scenario
+        scenario = self._planned.scenario
         plan = library.make_planner().plan(scenario.initial_state, scenario.goal)
         options = {"nominal": np.asarray(plan.states)} if plan.solved else {}
         self._observation, self._info = self.env.reset(seed=self._seed, options=options)
 
     def step(self) -> bool:
-        start = np.array([self._first])
-        action, self._state = self._policy.predict(self._observation, self._state, start, True)
+        action: Any = None
+        with Attempt() as attempt:
+            if self._first:
+                reseed(self._policy, self._seed)
+            action, self._state, _ = ask(
+                self._policy, self._observation, self._state, [self._first], ACTION
+            )
+        self.error = attempt.error
+        if self.error is not None:
+            return True
         self._first = False
         self._observation, _, terminated, truncated, self._info = self.env.step(action)
         return bool(terminated or truncated)
 
     def counters(self) -> dict[str, int]:
-        return _counters(self._policy, self._state)
+        return counted(self._policy, self._state)
 
     def outcome(self) -> str:
         info = self._info
-        reached = f"success at {info['success_time']:.1f} s" if info["success"] else "no success"
-        return f"{reached}, {'fallen' if info['fallen'] else 'upright'}, " + (
-            f"effort {info['effort']:.2f} N²s"
+        success = info["success"] and self.error is None
+        reached = f"success at {info['success_time']:.1f} s" if success else "no success"
+        return f"{reached}, {'fallen' if info['fallen'] else 'upright'}, " + _efforts(
+            "effort", info["effort_to_success"], info["effort"]
         )
 
 
@@ -274,63 +297,88 @@ class _SpacecraftGame:
         self._planner: Any = library.make_single_policy(settings.policy, self.env)
         self._policy: Any = self._planner
         if settings.safety_filter:
-            self._policy = library.make_filter(self._planner, self.env, bound)
-        self._global = getattr(self._policy, "observes", "local") == "global"
+            check_interface(f"policy {settings.policy!r}", self._planner)
+            with library.building(f"policy {settings.policy!r} with the safety filter"):
+                self._policy = library.make_filter(self._planner, self.env, bound)
+        self._options: dict[str, Any] = (
+            {} if self._scenario is None else {"scenario": self._scenario}
+        )
+        # An environment without a window, which would stand still while this plans.
+        self._still: Any = spacecraft_v0.parallel_env(preset=preset, settings=self.env.settings)
+        observations, _ = self._still.reset(seed=self._seed, options=self._options)
+        seen = self._seen(self._still, observations)
+        shapes = shapes_of(self._policy, 1, preset.agents)
+        rehearse(
+            f"policy {settings.policy!r}", self._policy, seen, np.ones(len(seen), bool), *shapes
+        )
+        self.error: str | None = None
         self._state: Any = None
         self._observations: dict[str, Any] = {}
         self._infos: dict[str, dict[str, Any]] = {}
         self._first = True
 
     def start(self) -> None:
-        _reseed(self._policy, self._seed)
-        options: dict[str, Any] = {} if self._scenario is None else {"scenario": self._scenario}
-        nominal = self._planned(options)
-        if nominal is not None:
-            options["nominal"] = nominal
-        self._observations, self._infos = self.env.reset(seed=self._seed, options=options)
+        nominal = self._nominal()
+        options = {} if nominal is None else {"nominal": nominal}
+        self._observations, self._infos = self.env.reset(
+            seed=self._seed, options=self._options | options
+        )
 
     def step(self) -> bool:
         # One world, or one row for each agent.
-        seen = self._seen(self.env, self._observations)
-        starts = np.full(len(seen), self._first)
-        actions, self._state = self._policy.predict(seen, self._state, starts, True)
-        self._first = False
         agents = self.env.agents
-        rows = np.asarray(actions).reshape(len(agents), -1)
+        rows: Any = None
+        with Attempt() as attempt:
+            if self._first:
+                reseed(self._policy, self._seed)
+            rows, self._state = self._ask(
+                self._policy, self.env, self._observations, self._state, self._first
+            )
+        self.error = attempt.error
+        if self.error is not None:
+            return True
+        self._first = False
         self._observations, _, _, _, self._infos = self.env.step(
             dict(zip(agents, rows, strict=True))
         )
         return not self.env.agents
 
     def counters(self) -> dict[str, int]:
-        return _counters(self._policy, self._state)
+        return counted(self._policy, self._state)
 
     def outcome(self) -> str:
         infos = self._infos.values()
         count = len(self._infos)
         arrived = sum(info["success"] for info in infos)
         collided = sum(info["collided"] for info in infos)
-        effort = sum(info["effort"] for info in infos)
+        to_success = sum(info["effort_to_success"] for info in infos) / count
+        to_end = sum(info["effort"] for info in infos) / count
         return (
-            f"{arrived} of {count} arrived, {collided} collided, effort {effort:.2f} N²s "
-            f"in {self.env.time:.1f} s"
+            f"{arrived} of {count} arrived, {collided} collided, in {self.env.time:.1f} s; "
+            + _efforts("mean effort of an agent", to_success, to_end)
         )
 
-    def _planned(self, options: dict[str, Any]) -> Any:
+    def _nominal(self) -> Any:
         """Return x_d (steps + 1, agents, 6) if the policy plans it at the start, else None."""
-        if not self._global:
+        if not is_global(self._policy):
             return None
-        # On an environment without a window, which would stand still while this plans.
-        env = spacecraft_v0.parallel_env(preset=self.env.preset, settings=self.env.settings)
-        env.reset(seed=self._seed, options=options)
-        _, memories = self._planner.predict(env.state()[None], None, np.array([True]), True)
-        try:
+        with Attempt():  # what it raises, it will raise in the episode
+            _, memories = self._ask(self._planner, self._still, {}, None, True)
             return memories[0].nominal
-        except (TypeError, IndexError, AttributeError):
-            return None
+        return None
+
+    def _ask(
+        self, policy: Any, env: Any, observations: dict[str, Any], state: Any, first: bool
+    ) -> tuple[Any, Any]:
+        """Return the actions, a row for each agent, and the policy's memory."""
+        seen = self._seen(env, observations)
+        starts = np.full(len(seen), first)
+        shapes = shapes_of(policy, 1, env.num_agents)
+        action, state, _ = ask(policy, seen, state, starts, *shapes)
+        return action, state
 
     def _seen(self, env: Any, observations: dict[str, Any]) -> Any:
-        if self._global:
+        if is_global(self._policy):
             return env.state()[None]
         return np.stack([observations[agent] for agent in env.agents])
 
@@ -359,14 +407,7 @@ def _preset(settings: WatchSettings, scenario: Scenario | None) -> Preset:
     )
 
 
-def _reseed(policy: Any, seed: int) -> None:
-    reseed = getattr(policy, "reseed", None)
-    if reseed is not None:
-        reseed(episode_streams(seed).policy)
-
-
-def _counters(policy: Any, state: Any) -> dict[str, int]:
-    counters = getattr(policy, "counters", None)
-    if counters is None or state is None:
-        return {}
-    return {str(name): int(count) for name, count in counters(state).items()}
+def _efforts(what: str, to_success: float, to_end: float) -> str:
+    """Return the effort as tables have it, and to the end of the episode where that is more."""
+    text = f"{what} to success {to_success:.2f} N²s"
+    return text if to_end == to_success else f"{text} (to the end {to_end:.2f} N²s)"

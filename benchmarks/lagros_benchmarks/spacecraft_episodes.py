@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_benchmarks.episodes import TUBE_TOLERANCE, added_up, describe_error
+from lagros_benchmarks.episodes import TUBE_TOLERANCE, added_up
+from lagros_benchmarks.flying import Answer, Attempt, ask, counted, reseed
 from lagros_benchmarks.library import FloatArray, Policy
-from lagros_envs.seeding import episode_streams
 from lagros_envs.spacecraft_task import THRUSTERS
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
 
@@ -70,8 +70,8 @@ class WorldRecord:
     Attributes:
         seed: Seed of the episode.
         planned: Whether the policy found a plan for all agents at the start; None if it makes none.
-        error: The exception that ended the episode, which is then a failure of every agent that had
-            not succeeded before; None if none did.
+        error: The exception that ended the episode, which is then a failure of every agent; None
+            if none did.
         agents: One record per agent.
     """
 
@@ -122,7 +122,7 @@ class Trace:
 
 def act(
     policy: Policy, env: SpacecraftVectorEnv, rows: Float32Array, state: Any, first: bool
-) -> tuple[Float32Array, Any]:
+) -> Answer:
     """Ask the policy for the actions of all agents of all worlds.
 
     Args:
@@ -133,13 +133,23 @@ def act(
         first: Whether the episodes begin.
 
     Returns:
-        Actions, shape (worlds * agents, 8), and the policy's memory.
+        Actions, shape (worlds * agents, 8), the policy's memory, and the time of the call.
+
+    Raises:
+        ValueError: The policy's answer is not such actions.
     """
     observation = env.state() if is_global(policy) else rows
     starts = np.full(len(observation), first)
-    action, state = policy.predict(observation, state, starts, True)
-    # A copy: the policy may go on with its own array.
-    return np.array(action, np.float32).reshape(env.num_envs, THRUSTERS), state
+    shapes = shapes_of(policy, env.num_worlds, env.num_agents)
+    return ask(policy, observation, state, starts, *shapes)
+
+
+def shapes_of(policy: Policy, worlds: int, agents: int) -> list[tuple[int, ...]]:
+    """Return the shapes that the actions of a policy may have; the first has a row per agent."""
+    rows = (worlds * agents, THRUSTERS)
+    if not is_global(policy):
+        return [rows]
+    return [rows, (worlds, agents, THRUSTERS), (worlds, agents * THRUSTERS)]
 
 
 def is_global(policy: Policy) -> bool:
@@ -148,9 +158,14 @@ def is_global(policy: Policy) -> bool:
 
 
 def bare(policy: Policy) -> Policy:
-    """Return a policy without the filter that it wears, which has it as `policy`."""
+    """Return a policy without the safety filter that it wears, which has it as `policy`.
+
+    A policy of the user's own may call something else so, the model that it asks for instance: only
+    a filter has the name of what it filters.
+    """
     inner = getattr(policy, "policy", None)
-    return policy if inner is None else bare(inner)
+    worn = getattr(policy, "name", None) == f"{getattr(inner, 'name', None)}+filter"
+    return inner if worn and inner is not None else policy
 
 
 def fly(
@@ -177,12 +192,13 @@ def fly(
         The records and counters.
     """
     trace = Trace() if trace is None else trace
-    problem: str | None = None
-    try:
+    counters: dict[str, int] = {}
+    with Attempt() as attempt:
         _fly(env, policy, seeds, trace, keep_path)
-    except Exception as error:
-        problem = describe_error(error)
-    return Flight(tuple(_records(env, seeds, trace, problem, margin)), _counters(policy, trace))
+    with Attempt() as counting:
+        counters = counted(policy, trace.state)
+    problem = attempt.error or counting.error
+    return Flight(tuple(_records(env, seeds, trace, problem, margin)), counters)
 
 
 def fly_chunk(
@@ -217,13 +233,11 @@ def _fly(
     shape = (env.num_worlds, env.num_agents)
     trace.over = np.zeros(shape[0], bool)
     trace.left_paper, trace.position_error = np.zeros(shape, bool), np.zeros(shape)
-    reseed = getattr(policy, "reseed", None)
-    if reseed is not None:
-        reseed(episode_streams(seeds[0]).policy)
+    reseed(policy, seeds[0])
     rows, info = env.reset(seed=list(seeds))
     _note(trace, env, info, keep_path)
     for step in range(env.settings.steps):
-        action, trace.state = act(policy, env, rows, trace.state, step == 0)
+        action, trace.state, _ = act(policy, env, rows, trace.state, step == 0)
         if step == 0:
             _find_plans(trace, policy, env)
             _hold_against_tube(trace, env, 0)
@@ -285,13 +299,6 @@ def _hold_against_tube(trace: Trace, env: SpacecraftVectorEnv, instant: int) -> 
     )
 
 
-def _counters(policy: Policy, trace: Trace) -> dict[str, int]:
-    counters = getattr(policy, "counters", None)
-    if counters is None or trace.state is None:
-        return {}
-    return {str(key): int(value) for key, value in counters(trace.state).items()}
-
-
 def _records(
     env: SpacecraftVectorEnv,
     seeds: Sequence[int],
@@ -319,6 +326,7 @@ def _agent(
         return _nothing()
     one = {name: values[world, agent].item() for name, values in trace.info.items()}
     ran = problem is None
+    success = ran and bool(one["success"])
     left_paper = left_certified = None
     error: float | None = None
     if trace.nominal is not None and trace.planned is not None:
@@ -328,10 +336,10 @@ def _agent(
         if margin is not None:
             left_certified = not kept or error > margin + TUBE_TOLERANCE
     return AgentRecord(
-        success=bool(one["success"]),
-        success_time=one["success_time"] if one["success"] else None,
+        success=success,
+        success_time=one["success_time"] if success else None,
         strict_success=ran and bool(one["strict_success"]),
-        paper_success=bool(one["paper_success"]),
+        paper_success=ran and bool(one["paper_success"]),
         collided=bool(one["collided"]),
         collision_time=one["collision_time"] if one["collided"] else None,
         effort=one["effort_to_success"],

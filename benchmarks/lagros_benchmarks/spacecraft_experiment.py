@@ -10,16 +10,17 @@ import numpy as np
 
 from lagros_benchmarks.episodes import added_up
 from lagros_benchmarks.experiment import BenchmarkRun
-from lagros_benchmarks.library import FloatArray, Policy, SetupError, Toolbox
+from lagros_benchmarks.flying import check_interface, rehearse
+from lagros_benchmarks.library import FloatArray, Policy, Toolbox, building
 from lagros_benchmarks.settings import BenchmarkSettings, Case
 from lagros_benchmarks.spacecraft_episodes import (
     Flight,
     Trace,
     WorldRecord,
-    act,
     fly,
     fly_chunk,
     is_global,
+    shapes_of,
 )
 from lagros_benchmarks.spacecraft_timing import PLAN_WORLDS, Timing, time_plans, time_policy
 from lagros_benchmarks.workers import Progress
@@ -89,22 +90,21 @@ class SpacecraftExperiment:
         """Build everything once, so that a damaged file ends the run before it has begun.
 
         Raises:
-            SetupError: A policy cannot be built, or no scenario can be drawn.
+            SetupError: A policy cannot be built or cannot run, or no scenario can be drawn.
         """
         experiment = cls(settings, toolbox, 0.0)
-        building = "the environment"
         period = 0.0
-        try:
-            for case in settings.cases:
-                building = f"the environment of {case.agents} agents"
+        rehearsed: set[str] = set()
+        # Beginning with the smallest worlds, of which one call is quick.
+        for case in sorted(settings.cases, key=lambda case: case.agents or 0):
+            with building(f"the environment of {case.agents} agents"):
                 env = experiment.environment(case, 1)
                 env.reset(seed=[0])
                 period = env.settings.control_period
-                building = f"policy {case.policy!r}"
-                building += " with the safety filter" if case.safety_filter else ""
-                experiment.policy(case, env)
-        except Exception as error:
-            raise SetupError.building(building, error) from error
+            policy = experiment.policy(case, env)
+            if case.policy not in rehearsed:
+                rehearsed.add(case.policy)
+                rehearse_in(env, case.policy, policy)
         return cls(settings, toolbox, period)
 
     @property
@@ -128,10 +128,20 @@ class SpacecraftExperiment:
         )
 
     def policy(self, case: Case, env: SpacecraftVectorEnv) -> Policy:
-        """Build the policy of a case, with its filter."""
+        """Build the policy of a case, with its filter.
+
+        Raises:
+            SetupError: It cannot be built.
+        """
         name, bound = case.policy, case.condition.bound
-        policy = self.toolbox.make_policy(name, env, self.settings.policy_settings.get(name, {}))
-        return self.toolbox.make_filter(policy, env, bound) if case.safety_filter else policy
+        given = self.settings.policy_settings.get(name, {})
+        with building(f"policy {name!r}"):
+            policy = self.toolbox.make_policy(name, env, given)
+        if not case.safety_filter:
+            return policy
+        check_interface(f"policy {name!r}", policy)
+        with building(f"policy {name!r} with the safety filter"):
+            return self.toolbox.make_filter(policy, env, bound)
 
     def units(self, progress: Progress | None) -> list[int]:
         """Return the seed of every world: each policy plans for itself."""
@@ -151,7 +161,7 @@ class SpacecraftExperiment:
         """Measure the times of the calls, and of more plans than those worlds need."""
         env = self.environment(case, 1)
         policy = self.policy(case, env)
-        _warm_up(env, policy)
+        rehearse_in(env, case.policy, policy)
         timing = time_policy(env, policy, units)
         if not is_global(policy):
             return [timing]
@@ -228,11 +238,18 @@ def _middle(values: Sequence[Value]) -> Value:
     return values[(len(values) - 1) // 2]
 
 
-def _warm_up(env: SpacecraftVectorEnv, policy: Policy) -> None:
-    """Call the policy once, so that what its first call loads is not timed."""
+def rehearse_in(env: SpacecraftVectorEnv, name: str, policy: Policy) -> None:
+    """Ask a policy once in a world, so that what its first call loads is not timed.
+
+    Args:
+        env: One world.
+        name: The policy, as the run was asked for it.
+        policy: The policy.
+
+    Raises:
+        SetupError: It cannot run.
+    """
     rows, _ = env.reset(seed=[0])
-    # An exception is the episodes' business, where it is written down.
-    try:
-        act(policy, env, rows, None, first=True)
-    except Exception:
-        return
+    seen = env.state() if is_global(policy) else rows
+    shapes = shapes_of(policy, 1, env.num_agents)
+    rehearse(f"policy {name!r}", policy, seen, np.ones(len(seen), bool), *shapes)

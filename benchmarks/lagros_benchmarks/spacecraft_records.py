@@ -40,6 +40,7 @@ def rows(run: SpacecraftRun) -> list[Row]:
             **_times(run.timing[case], run.control_period),
             **_tracking(worlds),
             "counters": dict(run.counters[case]),
+            "raised": sum(world.error is not None for world in worlds),
             "errors": [{"seed": w.seed, "text": w.error} for w in worlds if w.error is not None],
             "versus": _versus(run, case),
             "filter_effect": _filter_effect(run, case),

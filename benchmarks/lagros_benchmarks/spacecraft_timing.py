@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
+from lagros_benchmarks.flying import Attempt, ask, reseed
 from lagros_benchmarks.library import FloatArray, Policy
-from lagros_benchmarks.spacecraft_episodes import Float32Array, act, is_global
-from lagros_envs.seeding import episode_streams
+from lagros_benchmarks.spacecraft_episodes import act, is_global
+from lagros_envs.spacecraft_task import THRUSTERS
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
 
 # A joint plan is made once a world, so that the few worlds of the pass would time too few plans.
@@ -57,11 +57,8 @@ def time_policy(env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int]) 
     for index, seed in enumerate(seeds):
         alone = None if is_global(policy) else index % env.num_agents
         times = _WorldTimes([], [])
-        try:
+        with Attempt():
             _time_world(env, policy, seed, alone, times)
-        except Exception:
-            if not times.batches:
-                continue
         batches += times.batches
         if alone is None:
             plans += times.batches[:1]
@@ -75,13 +72,9 @@ def time_plans(env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int]) -
     """Return the times of the first calls alone [s], of a policy for all agents together."""
     times = []
     for seed in seeds:
-        try:
+        with Attempt():  # as above
             rows, _ = env.reset(seed=[seed])
-            begin = perf_counter()
-            act(policy, env, rows, None, first=True)
-        except Exception:
-            continue  # as above
-        times.append(perf_counter() - begin)
+            times.append(act(policy, env, rows, None, first=True).seconds)
     return np.array(times)
 
 
@@ -96,28 +89,18 @@ class _WorldTimes:
 def _time_world(
     env: SpacecraftVectorEnv, policy: Policy, seed: int, alone: int | None, times: _WorldTimes
 ) -> None:
-    reseed = getattr(policy, "reseed", None)
-    if reseed is not None:
-        reseed(episode_streams(seed).policy)
+    reseed(policy, seed)
     rows, _ = env.reset(seed=[seed])
     state: Any = None
     own_state: Any = None
     for step in range(env.settings.steps):
         first = step == 0
-        begin = perf_counter()
-        action, state = act(policy, env, rows, state, first)
-        times.batches.append(perf_counter() - begin)
+        action, state, seconds = act(policy, env, rows, state, first)
+        times.batches.append(seconds)
         if alone is not None:
-            seconds, own_state = _time_alone(policy, rows[alone : alone + 1], own_state, first)
+            row = rows[alone : alone + 1]
+            _, own_state, seconds = ask(policy, row, own_state, [first], (1, THRUSTERS))
             times.alone.append(seconds)
         rows, _, terminated, truncated, _ = env.step(action)
         if (terminated | truncated).any():
             return
-
-
-def _time_alone(policy: Policy, row: Float32Array, state: Any, first: bool) -> tuple[float, Any]:
-    start = np.array([first])
-    begin = perf_counter()
-    action, state = policy.predict(row, state, start, True)
-    np.asarray(action, dtype=np.float32)
-    return perf_counter() - begin, state

@@ -64,7 +64,11 @@ def watch(
         float | None, typer.Option(help="End after so many seconds of the episode.")
     ] = None,
 ) -> None:
-    """Watch one episode: agents, thrusters, sensing, tubes, goals, collisions."""
+    """Watch one episode: agents, thrusters, sensing, tubes, goals, collisions.
+
+    Exit status 3: the policy raised, which ended the episode as a failure.
+    """
+    from lagros_benchmarks.flying import RAISED
     from lagros_benchmarks.library import SetupError
     from lagros_benchmarks.playback import Playback, WatchSettings
     from lagros_envs.files import write_atomic
@@ -97,11 +101,8 @@ def watch(
         if video is not None:
             raise
         raise typer.Exit from None
-    except (ImportError, OSError) as error:
+    except (ImportError, OSError, RuntimeError) as error:
         fail(error, status=1)
-    except Exception as error:
-        # Whatever a policy raises in its episode.
-        fail(f"{type(error).__name__}: {error}", status=1)
     finally:
         playback.close()
     delivery = Delivery()
@@ -110,3 +111,5 @@ def watch(
     for line in playback.summary():
         typer.echo(line)
     delivery.tell(f"{playback.frames} frames, {len(content) / 1e6:.2g} MB")
+    if playback.error is not None:
+        raise typer.Exit(RAISED)

@@ -116,16 +116,11 @@ def test_an_exception_is_the_failure_of_its_own_world_alone():
             continue
         assert world.error == "ArithmeticError: no solution at all [bold]here[/bold]"
         for one, two in zip(world.agents, other.agents, strict=True):
-            # It was raised before 20.05 s: who had arrived by then has succeeded.
-            earlier = two.success and two.success_time <= 20.0
-            assert one.success <= two.success
-            if earlier:
-                assert one.success
-                assert one.success_time == two.success_time
-            if two.success and two.success_time > 24.0:
-                assert not one.success
-                assert one.success_time is None
-            assert not one.strict_success
+            # It was raised before 20.05 s, and is a failure also of who had arrived by then.
+            assert (one.success, one.success_time) == (False, None)
+            assert not (one.strict_success or one.paper_success)
+            assert one.collided <= two.collided
+            assert 0.0 < one.effort_total <= two.effort_total * (1 + 1e-4)
 
 
 class BadAction(fakes.IdlePolicy):
@@ -145,7 +140,7 @@ def test_a_bad_action_is_an_exception_of_the_policy(answer):
     assert len(flight.worlds) == 2
     for world in flight.worlds:
         assert world.error is not None
-        assert world.error.startswith("ValueError")
+        assert "predict " in world.error
         assert not any(agent.success or agent.strict_success for agent in world.agents)
 
 

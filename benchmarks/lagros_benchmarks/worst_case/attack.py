@@ -316,14 +316,13 @@ def _search_adversary(
     best: Found | None = None
     flights = 0
     while True:
-        flown = target.fly_adversaries(points)
+        scores, pushes = target.try_adversaries(points)
         flights += len(points)
-        worst = int(np.argmax(flown.scores))
-        if best is None or flown.scores[worst] > best.score:
-            sequence = flown.pushes[worst] / target.bound
-            best = Found(sequence, float(flown.scores[worst]), flights)
+        worst = int(np.argmax(scores))
+        if best is None or scores[worst] > best.score:
+            best = Found(pushes[worst] / target.bound, float(scores[worst]), flights)
         if flights > len(first_adversaries()):
-            chosen.tell(points, flown.scores)
+            chosen.tell(points, scores)
         if flights + settings.population > settings.budget:
             return Found(best.sequence, best.score, flights)
         points = chosen.ask()

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_benchmarks.flying import AnswerError, Attempt, ask
 from lagros_envs import cartpole_task as task
 from lagros_envs.disturbances import Disturbance, onto_unit_sphere
 from lagros_envs.dynamics import hold_step
@@ -30,6 +31,10 @@ GOALS = ("tube", "success", "clearance")
 # Differences of the closed loop. Networks run in float32, whose rounding of an observation times
 # the gain must stay far below the step.
 _STEP = 1e-3
+
+
+class UnfitError(ValueError):
+    """A policy is not one that a search can fly: many episodes at a time, without a memory."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +62,11 @@ class Episodes:
 
 @dataclass(frozen=True)
 class Flights:
-    """Closed-loop trajectories.
+    """Closed-loop trajectories. One whose policy raised counts as fallen from there on.
 
     Attributes:
         states: x at every control instant, shape (b, steps + 1, 4); after a fall as at the fall.
-        forces: u, shape (b, steps, 1) [N].
+        forces: u, shape (b, steps, 1) [N]; nan where the policy raised.
         alive: Whether the pole had not fallen *before* the instant, shape (b, steps + 1).
         fallen: Whether it fell, shape (b,).
     """
@@ -126,11 +131,29 @@ def tracking_law(expert: CartPoleExpert, episodes: Episodes) -> Law:
 def policy_law(policy: Any, episodes: Episodes) -> Law:
     """Return a policy that keeps no memory as a law.
 
+    Where it raises on a batch, its rows are asked one by one, and the force of a row that raises is
+    nan: its flight ends there.
+
     Raises:
-        ValueError: The policy remembers something between its calls, or answers a batch by
+        UnfitError: The policy remembers something between its calls, or answers a batch by
             anything but one action for each row.
     """
     settings = episodes.settings
+    name = getattr(policy, "name", policy)
+
+    def asked(rows: NDArray[np.float32]) -> FloatArray:
+        starts = np.ones(len(rows), bool)
+        try:
+            answer = ask(policy, rows, None, starts, (len(rows), 1))
+        except AnswerError as error:
+            raise UnfitError(
+                f"policy {name!r}: {error}. A search flies many episodes at a time"
+            ) from error
+        if answer.state is not None:
+            raise UnfitError(
+                f"policy {name!r} keeps a memory; a search needs one that does not, or tube-mpc"
+            )
+        return _applied(settings, answer.action)
 
     def law(state: FloatArray, episode: IntArray, step: IntArray) -> FloatArray:
         rows = np.empty((len(state), task.OBSERVATION_DIM), np.float32)
@@ -138,19 +161,13 @@ def policy_law(policy: Any, episodes: Episodes) -> Law:
         rows[:, task.GOAL] = episodes.goals[episode]
         rows[:, task.INITIAL_STATE] = episodes.initial_states[episode]
         rows[:, task.TIME] = step * settings.control_period
-        action, memory = policy.predict(rows, None, np.ones(len(rows), bool), True)
-        if memory is not None:
-            raise ValueError(
-                f"policy {getattr(policy, 'name', policy)!r} keeps a memory; a search needs one "
-                "that does not, or tube-mpc"
-            )
-        if np.shape(action) != (len(rows), 1):
-            raise ValueError(
-                f"policy {getattr(policy, 'name', policy)!r} answers {len(rows)} observations, "
-                f"shape {rows.shape}, by actions of shape {np.shape(action)}; a search flies many "
-                f"episodes at a time and needs {(len(rows), 1)}"
-            )
-        return _applied(settings, action)
+        with Attempt(UnfitError):
+            return asked(rows)
+        forces = np.full((len(rows), 1), np.nan)
+        for row in range(len(rows) if len(rows) > 1 else 0):
+            with Attempt(UnfitError):
+                forces[row] = asked(rows[row : row + 1])[0]
+        return forces
 
     return law
 
@@ -180,7 +197,7 @@ def fly(episodes: Episodes, law: Law, episode: IntArray, pushes: FloatArray) -> 
             distance = task.goal_distance(following.T, episodes.goals[episode].T, np.sqrt)
         sane = distance <= task.LARGEST_DISTANCE
         state = np.where((up & sane)[:, None], following, state)
-        forces[:, step] = force * up[:, None]
+        forces[:, step] = np.where(up[:, None], force, 0.0)
         alive[:, step + 1] = up
         up = up & sane & (np.abs(state[:, 1]) <= task.FALL_ANGLE)
         states[:, step + 1] = state
@@ -224,7 +241,8 @@ def scores(
     """Return how bad each flight is, shape (b,), and the instant at which it is, shape (b,).
 
     "clearance" takes the largest of the profile, the fall with it; "tube" the largest and "success"
-    the least while the pole is up. Success is broken where that is positive.
+    the least while the pole is up. Success is broken where that is positive. A flight whose policy
+    raised is infinitely bad, whatever the goal.
     """
     values = profile(episodes, goal, episode, flights.states)
     # The state at the instant of the fall says only how hard the last force was.
@@ -236,7 +254,8 @@ def scores(
     else:
         values = np.where(counted, values, -np.inf)
         instant = np.argmax(values, axis=1)
-    return values[np.arange(len(values)), instant], instant
+    worst = values[np.arange(len(values)), instant]
+    return np.where(np.isnan(flights.forces).any(axis=(1, 2)), np.inf, worst), instant
 
 
 def gradient(
@@ -294,7 +313,7 @@ def _profile_slope(
     return here - target
 
 
-def _applied(settings: task.CartPoleSettings, action: FloatArray) -> FloatArray:
+def _applied(settings: task.CartPoleSettings, action: NDArray[Any]) -> FloatArray:
     single = np.asarray(action, np.float32).astype(np.float64)
     force: FloatArray = task.applied_force(settings, single, np.clip)
     return force

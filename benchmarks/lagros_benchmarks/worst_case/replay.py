@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401  (registers the environments)
-from lagros_benchmarks.episodes import TUBE_TOLERANCE, describe_error
+from lagros_benchmarks.episodes import ACTION, TUBE_TOLERANCE
+from lagros_benchmarks.flying import Attempt, ask, reseed
 from lagros_benchmarks.library import Policy
 from lagros_benchmarks.worst_case.cartpole import Episodes, Flights, scores
 from lagros_benchmarks.worst_case.sequences import Replay
@@ -81,10 +82,10 @@ def replay_cartpole(
         disable_env_checker=True,
     ).unwrapped
     seed = episodes.seeds[index]
-    try:
+    with Attempt() as attempt:
         flight, info = _cartpole_flight(env, policy, seed, episodes.plans[index])
-    except Exception as error:
-        return Outcome(seed, math.inf, True, {}, describe_error(error)), None
+    if attempt.error is not None:
+        return Outcome(seed, math.inf, True, {}, attempt.error), None
     where = np.array([index])
     score = float(scores(episodes, goal, where, flight)[0][0])
     errors = np.linalg.norm(flight.states[0] - episodes.plans[index], axis=-1)[flight.alive[0]]
@@ -113,12 +114,13 @@ def _cartpole_flight(
     forces = np.zeros((1, settings.steps, 1))
     alive = np.zeros(states.shape[:2], bool)
     alive[0, 0] = True
+    reseed(policy, seed)
     memory: Any = None
     over = False
     for step in range(settings.steps):
-        action, memory = policy.predict(observation, memory, np.array([step == 0]), True)
-        forces[0, step] = settings.force_scale * float(np.asarray(action, np.float32)[0])
-        observation, _, over, _, info = env.step(np.asarray(action, np.float32))
+        action, memory, _ = ask(policy, observation, memory, [step == 0], ACTION)
+        forces[0, step] = settings.force_scale * float(action[0])
+        observation, _, over, _, info = env.step(action)
         states[0, step + 1 :] = env.state
         alive[0, step + 1] = True
         if over:
@@ -134,10 +136,10 @@ def replay_spacecraft(target: SpacecraftTarget, pushes: FloatArray) -> Outcome:
         pushes: d, shape (steps, agents, 6).
     """
     given = Replay(pushes, SpacecraftSettings().control_period)
-    try:
+    with Attempt() as attempt:
         flown = target.fly(target.environment(1, given))
-    except Exception as error:
-        return Outcome(target.seed, math.inf, True, {}, describe_error(error))
+    if attempt.error is not None:
+        return Outcome(target.seed, math.inf, True, {}, attempt.error)
     success, collided = flown.info["success"][0], flown.info["collided"][0]
     ratio = None if target.margin is None else float(flown.position_error.max()) / target.margin
     broken = {

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_benchmarks.flying import Attempt, reseed
 from lagros_benchmarks.library import Policy
-from lagros_benchmarks.spacecraft_episodes import act, bare, plans_of
+from lagros_benchmarks.spacecraft_episodes import act, bare, is_global, plans_of
 from lagros_envs import spacecraft_task as task
 from lagros_envs.disturbances import Situation, onto_unit_sphere
 from lagros_envs.scenarios import Scenario
@@ -164,6 +165,10 @@ class SpacecraftTarget:
             )
         remember_plans(self.policy)
 
+    @property
+    def _steps(self) -> int:
+        return task.SpacecraftSettings().steps
+
     def environment(self, worlds: int, disturbance: Any) -> SpacecraftVectorEnv:
         """Return worlds under a disturbance."""
         return SpacecraftVectorEnv(
@@ -176,25 +181,50 @@ class SpacecraftTarget:
             autoreset_mode="disabled",
         )
 
-    def fly_adversaries(self, points: FloatArray) -> SpacecraftFlights:
-        """Fly one world per adversary, points (worlds, `PARAMETERS`)."""
+    def try_adversaries(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how bad each adversary is, shape (worlds,), and its d as in `SpacecraftFlights`.
+
+        Where the policy raises the adversaries fly one by one, and one under which it does so is
+        infinitely bad.
+        """
+        pushes = np.zeros((len(points), self._steps, self.agents, task.STATE_DIM))
+        with Attempt():
+            return self.fly_adversaries(points, pushes).scores, pushes
+        if len(points) == 1:
+            return np.array([np.inf]), pushes
+        parts = [self.try_adversaries(points[at : at + 1]) for at in range(len(points))]
+        scores, flown = zip(*parts, strict=True)
+        return np.concatenate(scores), np.concatenate(flown)
+
+    def fly_adversaries(
+        self, points: FloatArray, pushes: FloatArray | None = None
+    ) -> SpacecraftFlights:
+        """Fly one world per adversary, points (worlds, `PARAMETERS`); `pushes` as for `fly`."""
         env = self.environment(1, "none")
         rows, _ = env.reset(seed=[self.seed])
         scenario = env.scenarios[0]
         assert scenario is not None
-        _, state = act(self.policy, env, rows, None, True)
+        state = act(self.policy, env, rows, None, True).state
         nominal = _nominal_of(state, env)
         adversary = Adversary(points, scenario, nominal, env.settings.control_period)
-        return self.fly(self.environment(len(points), adversary))
+        return self.fly(self.environment(len(points), adversary), pushes)
 
-    def fly(self, env: SpacecraftVectorEnv) -> SpacecraftFlights:
-        """Fly all worlds of an environment to the time limit."""
+    def fly(self, env: SpacecraftVectorEnv, pushes: FloatArray | None = None) -> SpacecraftFlights:
+        """Fly all worlds of an environment to the time limit.
+
+        Args:
+            env: The worlds.
+            pushes: Filled as they fly, shape (worlds, steps, agents, 6), for those who want to know
+                how far the worlds came where the policy raises.
+        """
         shape = (env.num_worlds, self.agents)
         rows, info = env.reset(seed=[self.seed] * shape[0])
         scene = env.scenarios[0]
         assert scene is not None
         steps = env.settings.steps
-        pushes = np.zeros((shape[0], steps, self.agents, task.STATE_DIM))
+        if pushes is None:
+            pushes = np.zeros((shape[0], steps, self.agents, task.STATE_DIM))
+        reseed(self.policy, self.seed)
         # The start belongs to the scenario, not to the policy.
         gap = np.full(shape[0], np.inf)
         misses = info["goal_distance"].reshape(shape) - env.settings.goal_radius
@@ -202,7 +232,7 @@ class SpacecraftTarget:
         state: Any = None
         nominal: FloatArray | None = None
         for step in range(steps):
-            action, state = act(self.policy, env, rows, state, step == 0)
+            action, state, _ = act(self.policy, env, rows, state, step == 0)
             if step == 0:
                 nominal = _nominal_of(state, env)
                 error = None if nominal is None else np.zeros(shape)
@@ -291,8 +321,9 @@ class PlansOnce:
 def remember_plans(policy: Policy) -> None:
     """Let the joint planner of a policy, if it has one, plan each scenario once."""
     inner: Any = bare(policy)
-    if getattr(inner, "observes", "") == "global" and not isinstance(inner.planner, PlansOnce):
-        inner.planner = PlansOnce(inner.planner)
+    planner = getattr(inner, "planner", None)
+    if planner is not None and is_global(inner) and not isinstance(planner, PlansOnce):
+        inner.planner = PlansOnce(planner)
 
 
 def _nominal_of(state: Any, env: SpacecraftVectorEnv) -> FloatArray | None:
