@@ -77,7 +77,10 @@ def attack(
         ),
     ] = None,
 ) -> None:
-    """Search the worst bounded disturbance, fly it, and hold the certificate against it."""
+    """Search the worst bounded disturbance, fly it, and hold the certificate against it.
+
+    Exit status 3: everything is written, and the policy raised in some episodes, which are broken.
+    """
     from lagros_benchmarks.library import SetupError
 
     find_users_modules()
@@ -147,6 +150,12 @@ def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> No
     for line in summary(found.row):
         typer.echo(line)
     delivery.tell()
+    if found.row["errors"]:
+        from lagros_benchmarks.flying import RAISED, raised_line
+
+        line = raised_line([(settings.policy, found.row["errors"], found.row["episodes"])])
+        typer.echo(f"lagros: {line}", err=True)
+        raise typer.Exit(RAISED)
 
 
 def _replay(task: str, path: Path) -> None:

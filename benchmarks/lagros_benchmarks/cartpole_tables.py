@@ -6,14 +6,17 @@ from collections.abc import Iterator, Sequence
 
 from lagros_benchmarks.experiment import Row
 from lagros_benchmarks.formats import (
+    EFFORT_RATIO,
     LONGEST_LABEL,
     Column,
     condition_title,
+    mark,
     markdown_table,
     milliseconds,
     number,
     percent,
     policy_label,
+    row_label,
     with_interval,
 )
 
@@ -21,14 +24,15 @@ _REFERENCES = ("tube-mpc", "lagros")
 
 LEGEND = (
     "Success and strict success (inside the tube at the time limit, never fell) with 95 % "
-    "intervals; effort: integral of u² to success, else to the end; Δt: time of one call of "
-    "predict; left tube: episodes whose error x - x_d ever left the paper's tube."
+    "intervals; effort: mean integral of u² to success, else to the end; Δt: time of one call of "
+    "predict; left tube: episodes that fell, have no plan, or whose error x - x_d ever left the "
+    "paper's tube."
 )
 
 
 # Heading (two lines) and content of each column of the terminal and LaTeX tables.
 COLUMNS: tuple[Column, ...] = (
-    ("policy", "", lambda row: policy_label(row["policy"])),
+    ("policy", "", row_label),
     ("success", "%", lambda row: with_interval(row["success_rate"], row["success_ci95"])),
     ("strict", "%", lambda row: percent(row["strict_success_rate"])),
     ("effort", "N²s", lambda row: number(row["effort_mean"])),
@@ -58,7 +62,7 @@ def comparison_lines(group: Sequence[Row]) -> Iterator[str]:
     if len(names) < 2:
         return
     reference = next((name for name in _REFERENCES if name in names), names[0])
-    yield f"Against {policy_label(reference)} on the same episodes:"
+    yield f"Against {policy_label(reference)} on the same episodes; {EFFORT_RATIO}:"
     for row in group:
         if row["policy"] != reference:
             name = f"{policy_label(row['policy']):<{LONGEST_LABEL}}"
@@ -85,7 +89,7 @@ def markdown_grids(groups: Sequence[Sequence[Row]]) -> list[str]:
     contents = []
     for group in groups:
         line = [group[0]["disturbance"], f"{group[0]['bound']:g}"]
-        line += [percent(row["success_rate"]) for row in group]
+        line += [percent(row["success_rate"]) + mark(row) for row in group]
         if paired:
             ours = next(row for row in group if row["policy"] == "lagros")
             change = ours["versus"]["tube-mpc"]["success_difference"]

@@ -145,7 +145,10 @@ def bench(
         Path | None, _file("Every episode (every agent), as JSON Lines.")
     ] = None,
 ) -> None:
-    """Compare policies on the same episodes; print the table, write what is asked for."""
+    """Compare policies on the same episodes; print the table, write what is asked for.
+
+    Exit status 3: everything is written, and some episodes raised; their rows are marked.
+    """
     from lagros_benchmarks.report import Outputs
     from lagros_benchmarks.settings import BenchmarkSettings, check_policy, check_task
     from lagros_policies.backends import Backend

@@ -21,7 +21,7 @@ from lagros_benchmarks.canvas import (
     styles,
 )
 from lagros_benchmarks.experiment import Row
-from lagros_benchmarks.formats import by_condition, condition_title, policy_label
+from lagros_benchmarks.formats import by_condition, condition_title, raised_note, row_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -85,7 +85,7 @@ def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
         axes.fill_between(times, low, high, color=style.colour, alpha=0.15, linewidth=0)
         axes.plot(times, means[name], color=style.colour, linestyle=style.line, linewidth=2)
         last = means[name][np.isfinite(means[name])][-1]
-        labels.append((float(last), policy_label(name, LONGEST_LABEL), style.colour))
+        labels.append((float(last), row_label(row, longest=LONGEST_LABEL), style.colour))
     axes.plot(times, tube, color=BLACK, linewidth=1.5)
     labels.append((float(tube[-1]), "paper tube r(t)", BLACK))
     axes.set(xlim=(times[0], times[-1]), ylim=(max(floor, 1e-3) if logarithmic else 0.0, ceiling))
@@ -95,7 +95,7 @@ def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
     episodes = rows[0]["episodes"]
     axes.set_title(f"{condition_title(rows[0])}, {episodes} episodes", loc="left", fontsize=10)
     text = "lines: mean; bands: 10th to 90th percentile; a fall keeps its largest error"
-    caption(figure, text)
+    caption(figure, text + raised_note(rows))
     _label_ends(axes, labels)
     return save(figure, path)
 
@@ -137,7 +137,7 @@ def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
                 capsize=2,
                 linewidth=1.6,
                 elinewidth=1,
-                label=policy_label(name, LONGEST_LABEL),
+                label=row_label(*own, longest=LONGEST_LABEL),
             )
         axes.set_title(kind, loc="left", fontsize=10)
         axes.set(ylim=(-4, 104), yticks=(0, 25, 50, 75, 100))

@@ -11,6 +11,10 @@ from lagros_benchmarks.experiment import Row
 # The letters that the paper gives its methods.
 _LETTERS = {"learned": "(a)", "tube-mpc": "(b)", "lagros": "(c)", "centralized": "(d)"}
 LONGEST_LABEL = 12
+# What "effort ×" means wherever two policies are compared.
+EFFORT_RATIO = "effort ratio where both succeed"
+# Stands behind the name of a policy some of whose episodes raised.
+RAISED_MARK = "!"
 _DIGITS = 3
 # Heading (two lines) and content of a column.
 Column = tuple[str, str, Callable[[Row], str]]
@@ -22,6 +26,36 @@ def policy_label(policy: str, longest: int = LONGEST_LABEL) -> str:
         return f"{_LETTERS[policy]} {policy}"
     name = Path(policy).name if policy.endswith(".zip") else policy.rpartition(":")[2]
     return name if len(name) <= longest else name[: longest - 1] + "…"
+
+
+def row_label(*rows: Row, longest: int = LONGEST_LABEL) -> str:
+    """Return the name of the policy of some rows, marked where episodes raised."""
+    return policy_label(rows[0]["policy"], longest) + mark(*rows)
+
+
+def mark(*rows: Row) -> str:
+    """Return what marks rows in which episodes raised; see `raised_lines`."""
+    return RAISED_MARK if any(row["errors"] for row in rows) else ""
+
+
+def raised_note(rows: Sequence[Row]) -> str:
+    """Return what the mark means, for the end of a figure's caption; "" without one."""
+    return f"\n{RAISED_MARK} some episodes raised and count as failures" if mark(*rows) else ""
+
+
+def raised_lines(rows: Sequence[Row]) -> list[str]:
+    """Return a line for every row in which episodes raised, for below a table."""
+    lines = []
+    for row in rows:
+        if row["errors"]:
+            filtered = " + filter" if row["safety_filter"] else ""
+            what = "episodes" if row["task"] == "cartpole" else "worlds"
+            lines.append(
+                f"{RAISED_MARK} {policy_label(row['policy'])}{filtered}, {row['disturbance']} "
+                f"{row['bound']:g}: {len(row['errors'])} of {row['episodes']} {what} raised and "
+                "count as failures"
+            )
+    return lines
 
 
 def short_label(policy: str) -> str:
@@ -117,4 +151,5 @@ def signed(value: float) -> str:
 def markdown_table(headings: Sequence[str], contents: Sequence[Sequence[str]]) -> str:
     """Return a Markdown table, its first column to the left."""
     rule = ["---", *["---:"] * (len(headings) - 1)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in (headings, rule, *contents))
+    lines = ([cell.replace("|", r"\|") for cell in line] for line in (headings, rule, *contents))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

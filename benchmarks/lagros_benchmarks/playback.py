@@ -236,11 +236,13 @@ class _CartPoleGame:
             render_mode=render_mode,
             disable_env_checker=True,
         ).unwrapped
-        self._policy: Any = library.make_single_policy(settings.policy, self.env)
         # On an environment without a window, which would stand still while this plans.
         self._planned: Any = gym.make("lagros/CartPole-v0", disable_env_checker=True).unwrapped
         seen, _ = self._planned.reset(seed=settings.seed)
-        rehearse(f"policy {settings.policy!r}", self._policy, seen, [True], ACTION)
+        name, build = f"policy {settings.policy!r}", library.make_single_policy
+        rehearse(name, build(settings.policy, self.env), seen, [True], ACTION)
+        # Another one flies: a policy may count its calls without being told.
+        self._policy: Any = build(settings.policy, self.env)
         self.error: str | None = None
         self._state: Any = None
         self._info: dict[str, Any] = {}
@@ -284,7 +286,7 @@ class _SpacecraftGame:
     """Spacecraft and the policy that flies all of them."""
 
     def __init__(self, settings: WatchSettings, render_mode: str) -> None:
-        self._seed = settings.seed
+        self._settings, self._seed = settings, settings.seed
         self._scenario = None if settings.scenario is None else Scenario.load(settings.scenario)
         preset = _preset(settings, self._scenario)
         bound = settings.disturbance_bound
@@ -294,23 +296,18 @@ class _SpacecraftGame:
             disturbance_bound=bound,
             render_mode=render_mode,
         )
-        self._planner: Any = library.make_single_policy(settings.policy, self.env)
-        self._policy: Any = self._planner
-        if settings.safety_filter:
-            check_interface(f"policy {settings.policy!r}", self._planner)
-            with library.building(f"policy {settings.policy!r} with the safety filter"):
-                self._policy = library.make_filter(self._planner, self.env, bound)
         self._options: dict[str, Any] = (
             {} if self._scenario is None else {"scenario": self._scenario}
         )
         # An environment without a window, which would stand still while this plans.
         self._still: Any = spacecraft_v0.parallel_env(preset=preset, settings=self.env.settings)
         observations, _ = self._still.reset(seed=self._seed, options=self._options)
-        seen = self._seen(self._still, observations)
-        shapes = shapes_of(self._policy, 1, preset.agents)
-        rehearse(
-            f"policy {settings.policy!r}", self._policy, seen, np.ones(len(seen), bool), *shapes
-        )
+        _, policy = self._built()
+        seen = self._seen(policy, self._still, observations)
+        shapes = shapes_of(policy, 1, preset.agents)
+        rehearse(f"policy {settings.policy!r}", policy, seen, np.ones(len(seen), bool), *shapes)
+        # Others fly: a policy may count its calls without being told.
+        self._planner, self._policy = self._built()
         self.error: str | None = None
         self._state: Any = None
         self._observations: dict[str, Any] = {}
@@ -371,14 +368,24 @@ class _SpacecraftGame:
         self, policy: Any, env: Any, observations: dict[str, Any], state: Any, first: bool
     ) -> tuple[Any, Any]:
         """Return the actions, a row for each agent, and the policy's memory."""
-        seen = self._seen(env, observations)
+        seen = self._seen(policy, env, observations)
         starts = np.full(len(seen), first)
         shapes = shapes_of(policy, 1, env.num_agents)
         action, state, _ = ask(policy, seen, state, starts, *shapes)
         return action, state
 
-    def _seen(self, env: Any, observations: dict[str, Any]) -> Any:
-        if is_global(self._policy):
+    def _built(self) -> tuple[Any, Any]:
+        """Return the policy, and again as it flies, with the filter that it may wear."""
+        settings, name = self._settings, f"policy {self._settings.policy!r}"
+        policy: Any = library.make_single_policy(settings.policy, self.env)
+        if not settings.safety_filter:
+            return policy, policy
+        check_interface(name, policy)
+        with library.building(f"{name} with the safety filter"):
+            return policy, library.make_filter(policy, self.env, settings.disturbance_bound)
+
+    def _seen(self, policy: Any, env: Any, observations: dict[str, Any]) -> Any:
+        if is_global(policy):
             return env.state()[None]
         return np.stack([observations[agent] for agent in env.agents])
 

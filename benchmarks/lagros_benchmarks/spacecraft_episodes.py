@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.episodes import TUBE_TOLERANCE, added_up
-from lagros_benchmarks.flying import Answer, Attempt, ask, counted, reseed
+from lagros_benchmarks.flying import Answer, Attempt, ask, counted, rehearse, reseed
 from lagros_benchmarks.library import FloatArray, Policy
 from lagros_envs.spacecraft_task import THRUSTERS
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
@@ -155,6 +155,23 @@ def shapes_of(policy: Policy, worlds: int, agents: int) -> list[tuple[int, ...]]
 def is_global(policy: Policy) -> bool:
     """Return whether the policy is fed `state()` of all worlds."""
     return getattr(policy, "observes", "local") == "global"
+
+
+def rehearse_in(env: SpacecraftVectorEnv, name: str, policy: Policy) -> None:
+    """Ask a policy once in a world, so that what its first call loads is not timed.
+
+    Args:
+        env: One world.
+        name: The policy, as the run was asked for it.
+        policy: The policy.
+
+    Raises:
+        SetupError: It cannot run.
+    """
+    rows, _ = env.reset(seed=[0])
+    seen = env.state() if is_global(policy) else rows
+    shapes = shapes_of(policy, 1, env.num_agents)
+    rehearse(f"policy {name!r}", policy, seen, np.ones(len(seen), bool), *shapes)
 
 
 def bare(policy: Policy) -> Policy:

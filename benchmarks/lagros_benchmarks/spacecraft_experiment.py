@@ -10,7 +10,7 @@ import numpy as np
 
 from lagros_benchmarks.episodes import added_up
 from lagros_benchmarks.experiment import BenchmarkRun
-from lagros_benchmarks.flying import check_interface, rehearse
+from lagros_benchmarks.flying import check_interface
 from lagros_benchmarks.library import FloatArray, Policy, Toolbox, building
 from lagros_benchmarks.settings import BenchmarkSettings, Case
 from lagros_benchmarks.spacecraft_episodes import (
@@ -20,7 +20,7 @@ from lagros_benchmarks.spacecraft_episodes import (
     fly,
     fly_chunk,
     is_global,
-    shapes_of,
+    rehearse_in,
 )
 from lagros_benchmarks.spacecraft_timing import PLAN_WORLDS, Timing, time_plans, time_policy
 from lagros_benchmarks.workers import Progress
@@ -236,20 +236,3 @@ def fly_scene(settings: BenchmarkSettings, world: int, toolbox: Toolbox) -> Scen
 
 def _middle(values: Sequence[Value]) -> Value:
     return values[(len(values) - 1) // 2]
-
-
-def rehearse_in(env: SpacecraftVectorEnv, name: str, policy: Policy) -> None:
-    """Ask a policy once in a world, so that what its first call loads is not timed.
-
-    Args:
-        env: One world.
-        name: The policy, as the run was asked for it.
-        policy: The policy.
-
-    Raises:
-        SetupError: It cannot run.
-    """
-    rows, _ = env.reset(seed=[0])
-    seen = env.state() if is_global(policy) else rows
-    shapes = shapes_of(policy, 1, env.num_agents)
-    rehearse(f"policy {name!r}", policy, seen, np.ones(len(seen), bool), *shapes)

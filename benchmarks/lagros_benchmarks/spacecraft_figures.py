@@ -21,7 +21,7 @@ from lagros_benchmarks.canvas import (
     styles,
 )
 from lagros_benchmarks.experiment import Row
-from lagros_benchmarks.formats import disturbance_title, policy_label, task_title
+from lagros_benchmarks.formats import disturbance_title, raised_note, row_label, task_title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,7 +92,7 @@ def _bound_figure(rows: Sequence[Row], path: Path) -> Path:
     caption(
         figure,
         f"{task_title(first)}, {first['episodes']} worlds per point; success per agent; bands: "
-        "95 % intervals over worlds",
+        "95 % intervals over worlds" + raised_note(rows),
     )
     _legend(figure, panels[0])
     return save(figure, path)
@@ -133,7 +133,7 @@ def _scale_figure(rows: Sequence[Row], path: Path) -> Path:
         figure,
         f"{first['task']}, {first['preset']}, {first['episodes']} worlds per point; success per "
         "agent; bands: 95 % intervals over worlds\ntime: filled, one agent's decision, or one plan "
-        "for all agents; open, per agent where one call decides for all",
+        "for all agents; open, per agent where one call decides for all" + raised_note(rows),
     )
     _legend(figure, panels[0])
     return save(figure, path)
@@ -165,7 +165,11 @@ def _policy_figure(rows: Sequence[Row], path: Path) -> Path:
         axes.grid(axis="y", visible=False)
         axes.grid(axis="x", color="#DDDDDD", linewidth=0.6)
     panels[1].set_xlim(left=0.0)
-    panels[0].set_yticks(range(len(policies)), [policy_label(n, LONGEST_LABEL) for n in policies])
+    labels = [
+        row_label(*(row for row in rows if row["policy"] == name), longest=LONGEST_LABEL)
+        for name in policies
+    ]
+    panels[0].set_yticks(range(len(policies)), labels)
     panels[0].set_ylim(len(policies) - 0.5, -0.5)
     first = rows[0]
     figure.suptitle(
@@ -177,7 +181,7 @@ def _policy_figure(rows: Sequence[Row], path: Path) -> Path:
     caption(
         figure,
         "success per agent; bars: 95 % intervals over worlds; open: without, filled: with the "
-        "safety filter",
+        "safety filter" + raised_note(rows),
     )
     return save(figure, path)
 
@@ -218,8 +222,7 @@ def _draw_lines(axes: Axes, rows: Sequence[Row], along: str, measure: _Measure) 
         ends = [measure.interval(row) or (np.nan, np.nan) for row in own]
         low, high = np.array(ends, dtype=np.float64).T
         axes.fill_between(places, low, high, color=style.colour, alpha=0.15, linewidth=0)
-        label = policy_label(own[0]["policy"], LONGEST_LABEL)
-        _draw_line(axes, places, values, style, label)
+        _draw_line(axes, places, values, style, row_label(*own, longest=LONGEST_LABEL))
 
 
 def _draw_line(

@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 
 from lagros_benchmarks.experiment import Row
 from lagros_benchmarks.formats import (
+    EFFORT_RATIO,
     Column,
     agents_title,
     condition_title,
     disturbance_title,
+    mark,
     markdown_table,
     milliseconds,
     number,
@@ -25,8 +27,9 @@ from lagros_benchmarks.formats import (
 LEGEND = (
     "Rates are per agent. Success: within 0.2 m of the goal before 45 s and any collision, with a "
     "95 % interval over worlds; strict: there at the end, never collided; paper: inside the "
-    "paper's tube around the goal; coll.: collided, ever. ∫‖u‖²: effort to success, else to the "
-    "end. Δt: one agent's decision; of a policy that plans for all agents together, that plan."
+    "paper's tube around the goal; coll.: collided, ever. ∫‖u‖²: mean effort of an agent to "
+    "success, else to the end. Δt: one agent's decision; of a policy that plans for all agents "
+    "together, that plan."
 )
 _LABEL = 15
 _WIDTH = 80
@@ -54,7 +57,7 @@ def _effort(row: Row) -> str:
 
 # Heading (two lines) and content of each column of the terminal and LaTeX tables.
 COLUMNS: tuple[Column, ...] = (
-    ("policy", "", _label),
+    ("policy", "", lambda row: _label(row) + mark(row)),
     ("success", "%", lambda row: with_interval(row["success_rate"], row["success_world_ci95"])),
     ("strict", "%", lambda row: percent(row["strict_success_rate"])),
     ("paper", "%", lambda row: percent(row["paper_success_rate"])),
@@ -87,13 +90,14 @@ def comparison_lines(group: Sequence[Row]) -> Iterator[str]:
     for filtered in (False, True):
         rows = [row for row in group if row["safety_filter"] is filtered]
         if len(rows) > 1:
-            yield f"On the same agents, {'with' if filtered else 'without'} the filter:"
+            which = "with" if filtered else "without"
+            yield f"On the same agents, {which} the filter; {EFFORT_RATIO}:"
         for row, following in itertools.pairwise(rows):
             names = f"{short_label(row['policy'])} − {short_label(following['policy'])}"
             yield from _comparison(names, row["versus"][following["policy"]])
     effects = [row for row in group if row["filter_effect"] is not None]
     if effects:
-        yield "What the filter changes:"
+        yield f"What the filter changes; {EFFORT_RATIO}:"
     for row in effects:
         yield from _comparison(policy_label(row["policy"], _LABEL), row["filter_effect"])
 
@@ -179,7 +183,7 @@ def _success(row: Row) -> str:
     # The wider side of the interval: near 100 % the other one is narrower.
     low, high = row["success_world_ci95"]
     rate = row["success_rate"]
-    return f"{percent(rate)} ±{100 * max(high - rate, rate - low):.1f}"
+    return f"{percent(rate)} ±{100 * max(high - rate, rate - low):.1f}{mark(row)}"
 
 
 _SUCCESS: Column = ("Success [%], ± the wider side of its 95 % interval over worlds", "", _success)

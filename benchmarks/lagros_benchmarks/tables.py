@@ -13,7 +13,7 @@ from lagros_benchmarks.formats import (
     by_condition,
     condition_title,
     markdown_table,
-    policy_label,
+    raised_lines,
 )
 
 if TYPE_CHECKING:
@@ -77,6 +77,7 @@ def _table(
 ) -> Table:
     from rich import box
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(
         title=title,
@@ -89,7 +90,8 @@ def _table(
     for index, heading in enumerate(headings):
         table.add_column(heading, justify="right" if index else "left", no_wrap=True)
     for line in contents:
-        table.add_row(*line)
+        # As text: the name of a file may hold what rich takes for markup.
+        table.add_row(*map(Text, line))
     return table
 
 
@@ -100,15 +102,8 @@ def _texts(row: Row) -> _Texts:
 def error_lines(rows: Sequence[Row], most: int = 5) -> Iterator[str]:
     """Yield what raised: how many episodes of each policy, and the first few texts."""
     for row in rows:
+        yield from raised_lines([row])
         errors = row["errors"]
-        if not errors:
-            continue
-        filtered = " + filter" if row["safety_filter"] else ""
-        what = "episodes" if row["task"] == "cartpole" else "worlds"
-        yield (
-            f"{policy_label(row['policy'])}{filtered}, {row['disturbance']} {row['bound']:g}: "
-            f"{len(errors)} of {row['episodes']} {what} raised and count as failures"
-        )
         for error in errors[:most]:
             yield f"  seed {error['seed']}: {error['text']}"
         if len(errors) > most:
@@ -151,6 +146,8 @@ _NESTED = (
     "filter_effect",
 )
 _LATEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "–": "--", "Δ": r"$\Delta$"}
+_LATEX |= {"\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$"}
+_LATEX |= {"^": r"\^{}", "~": r"\~{}"}
 _LATEX |= {"²": r"$^2$", "…": r"\ldots{}", "<": "$<$", "∫": r"$\int$", "‖": r"$\|$"}
 
 
@@ -176,6 +173,7 @@ def latex_text(rows: Sequence[Row]) -> str:
             ),
             r"\bottomrule",
             r"\end{tabular}",
+            *(rf"\par {_escape(line)}" for line in raised_lines(group)),
         ]
     return "\n".join(blocks) + "\n"
 
@@ -185,7 +183,8 @@ def markdown_text(rows: Sequence[Row]) -> str:
     groups = by_condition(rows)
     blocks = [f"    {' '.join(rows[0]['command'].split())}"] if rows else []
     if len(groups) > 1:
-        return "\n\n".join([*blocks, *_texts(rows[0]).markdown_grids(groups)]) + "\n"
+        grids = _texts(rows[0]).markdown_grids(groups)
+        return "\n\n".join([*blocks, *grids, *raised_lines(rows)]) + "\n"
     for group in groups:
         shown = columns(group[0])
         units = [f"{heading} [{unit}]" if unit else heading for heading, unit, _ in shown]
@@ -195,11 +194,10 @@ def markdown_text(rows: Sequence[Row]) -> str:
         heading, *lines = [*comparison_lines(group)] or [""]
         if lines:
             blocks += [heading, "\n".join(f"- {line.strip()}" for line in lines)]
+        blocks += raised_lines(group)
     return "\n\n".join(blocks) + "\n"
 
 
 def _escape(text: str) -> str:
     indent = r"\quad " if text.startswith("  ") else ""
-    for plain, latex in _LATEX.items():
-        text = text.replace(plain, latex)
-    return indent + text.strip()
+    return indent + "".join(_LATEX.get(letter, letter) for letter in text.strip())

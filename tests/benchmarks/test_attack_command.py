@@ -80,7 +80,7 @@ class Single:
     ("name", "status", "message"),
     [
         ("Unbuilt", 1, "policy 'mine_only:Unbuilt' cannot be built: TypeError: "),
-        ("Single", 2, "a search flies many episodes at a time and needs ("),
+        ("Single", 2, "it must be (2, 1). A search flies many episodes at a time"),
     ],
 )
 def test_a_class_that_cannot_be_searched_is_explained(

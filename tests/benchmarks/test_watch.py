@@ -202,16 +202,17 @@ def test_what_stands_still_is_the_same_in_every_frame_of_a_gif():
 
 
 @pytest.mark.parametrize("suffix", ["gif", "mp4"])
-def test_an_episode_that_breaks_leaves_the_old_file_and_no_other(invoke, tmp_path, suffix):
+def test_an_episode_that_breaks_is_shown_up_to_there(invoke, tmp_path, suffix):
     if suffix == "mp4":
         pytest.importorskip("imageio_ffmpeg")
     (tmp_path / "out").mkdir()
     target = tmp_path / "out" / f"x.{suffix}"
     target.write_text("old")
     result = invoke("spacecraft", "--policy", "pilots:Broken", "--agents", 2, "--video", target)
-    assert result.exit_code == 1
-    assert "ArithmeticError: no way out" in result.output
-    assert target.read_text() == "old"
+    assert result.exit_code == 3
+    assert "which counts as a failure: ArithmeticError: no way out" in result.output
+    assert "0 of 2 arrived" in result.output
+    assert target.read_bytes()[:3] != b"old"
     assert list((tmp_path / "out").iterdir()) == [target]
 
 
@@ -237,7 +238,8 @@ def test_a_scenario_of_ones_own_is_played(invoke, tmp_path):
     )
     assert result.exit_code == 0, result.output
     assert re.search(
-        r"in s\.json, none: 2 of 2 arrived, 0 collided, effort .* in 20\.0 s", result.output
+        r"in s\.json, none: 2 of 2 arrived, 0 collided, in 20\.0 s; mean effort of an agent",
+        result.output,
     )
     assert "plans 200" in result.output
     result = invoke(
@@ -278,7 +280,7 @@ def test_the_safety_filter_is_put_on(invoke, tmp_path, monkeypatch):
         *("--safety-filter", "--video", "x.gif"),
     )
     assert result.exit_code == 0, result.output
-    assert "effort 0.00" in result.output
+    assert "mean effort of an agent to success 0.00 N²s" in result.output
     assert seen["bound"] == 0.7
     assert seen["preset"].agents == 2
 

@@ -197,9 +197,9 @@ def test_the_search_of_an_adversary_keeps_the_worst_that_it_flew() -> None:
 
     def fly(points: FloatArray) -> Any:
         flown.append(points)
-        return SimpleNamespace(scores=points[:, 0], pushes=points[:, None, None, :6])
+        return points[:, 0], points[:, None, None, :6]
 
-    target: Any = SimpleNamespace(fly_adversaries=fly, bound=1.0)
+    target: Any = SimpleNamespace(try_adversaries=fly, bound=1.0)
     rng = np.random.default_rng(0)
     given = SearchSettings(budget=100, population=16)
     found = attack._search_adversary(target, given, rng)

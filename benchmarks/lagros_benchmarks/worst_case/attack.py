@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401  (registers the environments)
 from lagros_benchmarks.claims import position_margin
-from lagros_benchmarks.library import make_filter, make_single_policy
+from lagros_benchmarks.episodes import ACTION
+from lagros_benchmarks.flying import rehearse
+from lagros_benchmarks.library import building, make_filter, make_single_policy
 from lagros_benchmarks.metrics import wilson_interval
 from lagros_benchmarks.settings import check_policy, check_task
-from lagros_benchmarks.spacecraft_episodes import bare
+from lagros_benchmarks.spacecraft_episodes import bare, rehearse_in
 from lagros_benchmarks.worst_case.cartpole import (
     GOALS,
     CartPoleTarget,
@@ -207,7 +209,9 @@ class _CartPoleBench:
         """Build everything, and plan the episodes."""
         self.settings = settings
         env: Any = gym.make("lagros/CartPole-v0", disable_env_checker=True)
-        self.policy = cast(Any, make_single_policy(settings.policy, env))
+        name, build = f"policy {settings.policy!r}", make_single_policy
+        rehearse(name, build(settings.policy, env), env.reset(seed=0)[0], [True], ACTION)
+        self.policy = cast(Any, build(settings.policy, env))
         self.tracks = type(self.policy) in _TRACKERS
         # One whose metric is a network is held against the tube of its own.
         self.expert: CartPoleExpert = self.policy.expert if self.tracks else CartPoleExpert()
@@ -267,9 +271,11 @@ def _targets(settings: AttackSettings) -> list[SpacecraftTarget]:
     env = SpacecraftVectorEnv(
         settings.agents, settings.agents, settings.preset, "none", settings.bound
     )
+    rehearse_in(env, settings.policy, make_single_policy(settings.policy, env))
     policy = make_single_policy(settings.policy, env)
     if settings.safety_filter:
-        policy = make_filter(policy, env, settings.bound)
+        with building(f"policy {settings.policy!r} with the safety filter"):
+            policy = make_filter(policy, env, settings.bound)
     margin = position_margin(policy, settings.bound)
     return [
         SpacecraftTarget(
