@@ -6,6 +6,8 @@ inside it, so that `lagros --help` answers at once.
 
 from __future__ import annotations
 
+import sys
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -288,7 +290,12 @@ def run_and_report(settings: BenchmarkSettings, outputs: Outputs) -> list[Row]:
 
     Returns:
         The rows.
+
+    Raises:
+        typer.Exit: With status 1 if the run cannot begin or a file was not written, with 3 if
+            episodes raised.
     """
+    from lagros_benchmarks.flying import RAISED, raised_line
     from lagros_benchmarks.library import SetupError
     from lagros_benchmarks.records import summarise
     from lagros_benchmarks.report import print_report
@@ -296,7 +303,8 @@ def run_and_report(settings: BenchmarkSettings, outputs: Outputs) -> list[Row]:
     from lagros_policies.backends import BackendError
 
     try:
-        with progress_bar() as progress:
+        # What policies print is not ours.
+        with progress_bar() as progress, redirect_stdout(sys.stderr):
             run = run_benchmark(settings, progress=progress)
     except (SetupError, BackendError) as error:
         # No weights, damaged weights, an extra that is not installed, a cluster that is not there.
@@ -305,4 +313,8 @@ def run_and_report(settings: BenchmarkSettings, outputs: Outputs) -> list[Row]:
     delivery = outputs.write(run, rows)
     print_report(rows)
     delivery.tell()
+    if any(row["raised"] for row in rows):
+        raised = [(row["policy"], row["raised"], row["episodes"]) for row in rows if row["raised"]]
+        typer.echo(f"lagros: {raised_line(raised)}", err=True)
+        raise typer.Exit(RAISED)
     return rows

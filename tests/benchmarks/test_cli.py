@@ -78,7 +78,8 @@ def test_bench_prints_the_table_and_writes_the_files(invoke, faked, tmp_path):
     options = ("--json", "--csv", "--latex", "--figure", "--episodes-file")
     files = [word for pair in zip(options, names, strict=True) for word in pair]
     result = invoke("bench", "cartpole", "--episodes", "6", "--seed", "3", *files)
-    assert result.exit_code == 0, result.output
+    # One of the fakes raises in some episodes.
+    assert result.exit_code == 3, result.output
     for text in ("(a) learned", "(b) tube-mpc", "(c) lagros", "lqr", "Against (b) tube-mpc"):
         assert text in result.stdout
     assert "[bold]here[/bold]" in result.stdout

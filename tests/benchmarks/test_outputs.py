@@ -102,10 +102,12 @@ def test_no_line_of_the_table_is_longer_than_80_columns_or_cut(rows):
 
 def test_lines_below_the_table_name_the_reference_and_the_errors(rows):
     comparison = list(tables.comparison_lines(rows))
-    assert comparison[0] == "Against steady on the same episodes:"
+    assert comparison[0] == (
+        "Against steady on the same episodes; effort ratio where both succeed:"
+    )
     assert all(len(line) <= 80 for line in comparison)
     errors = list(tables.error_lines(rows, most=1))
-    assert errors[0].startswith("raising, uniform 0.75:")
+    assert errors[0].startswith("! raising, uniform 0.75:")
     assert "ArithmeticError" in errors[1]
 
 

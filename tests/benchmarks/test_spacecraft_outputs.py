@@ -141,7 +141,7 @@ def test_the_filter_stands_below_its_policy(sweep):
     begin = next(at for at, line in enumerate(lines) if line.startswith("(a) learned"))
     names = [line[:15].strip() for line in lines[begin : begin + 8]]
     assert names == [
-        *("(a) learned", "+ filter", "raising", "+ filter"),
+        *("(a) learned", "+ filter", "raising!", "+ filter!"),
         *("(c) lagros", "+ filter", "(d) centralized", "+ filter"),
     ]
     alone = [row for row in sweep[:8] if row["safety_filter"]]
@@ -305,8 +305,8 @@ def test_bench_prints_the_tables_and_writes_the_files(invoke, tmp_path):
         *("--agents", "2", "--bound", "0.2,0.4", "--timing-episodes", "1", "--seed", "5"),
         *written,
     )
-    assert result.exit_code == 0, result.output
-    for text in ("(b) tube-mpc", "(d) centralized", "+ filter", "(b) − (d)", "Success [%]"):
+    assert result.exit_code == 3, result.output  # worlds raised
+    for text in ("(b) tube-mpc!", "(d) centralized", "+ filter", "(b) − (d)", "Success [%]"):
         assert text in result.stdout
     assert "[ms]" in result.stdout
     assert width(result.stdout) <= WIDTH

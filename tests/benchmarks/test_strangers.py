@@ -1,0 +1,161 @@
+"""Policies that go wrong in every way, over every command that flies policies, on both tasks."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from lagros_benchmarks import cli
+from lagros_benchmarks.flying import AnswerError, Attempt, ask, describe_error
+from lagros_benchmarks.runner import run_benchmark
+from lagros_benchmarks.settings import BenchmarkSettings
+from tests.benchmarks import strangers
+
+PLACE = "tests.benchmarks.strangers"
+
+
+def name_of(kind):
+    return f"{PLACE}:{kind.__name__}"
+
+
+def bench(task, kind):
+    return (
+        *("bench", task, "--policies", name_of(kind), "--episodes", "1", "--bound", "0.3"),
+        *(("--agents", "2", "--safety-filter", "none") if task == "spacecraft" else ()),
+        *("--timing-episodes", "1", "--json", "out.json", "--latex", "out.tex"),
+        *("--csv", "out.csv", "--markdown", "out.md"),
+    )
+
+
+def watch(task, kind):
+    many = ("--agents", "2") if task == "spacecraft" else ()
+    return (
+        *("watch", task, "--policy", name_of(kind), *many, "--seconds", "1", "--speed", "10"),
+        *("--video", "out.gif"),
+    )
+
+
+def attack(task, kind):
+    return (
+        *("attack", task, "--policy", name_of(kind), "--episodes", "1", "--budget", "2"),
+        *("--json", "out.json"),
+    )
+
+
+COMMANDS = {"bench": bench, "watch": watch, "attack": attack}
+TASKS = ("cartpole", "spacecraft")
+EVERYWHERE = [(command, task) for command in COMMANDS for task in TASKS]
+
+
+@pytest.fixture
+def invoke(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return lambda *arguments: CliRunner().invoke(cli.app, arguments)
+
+
+@pytest.mark.parametrize("kind", strangers.UNFIT)
+@pytest.mark.parametrize(("command", "task"), EVERYWHERE)
+def test_what_cannot_run_is_refused_before_the_first_episode(invoke, tmp_path, command, task, kind):
+    result = invoke(*COMMANDS[command](task, kind))
+    assert result.exit_code == 1, result.output
+    assert isinstance(result.exception, SystemExit)
+    last = [line for line in result.stderr.splitlines() if line.startswith("lagros: ")]
+    assert len(last) == 1
+    assert kind.__name__ in last[0]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", strangers.FAILING)
+@pytest.mark.parametrize("task", TASKS)
+def test_an_episode_that_raises_is_a_marked_failure(invoke, tmp_path, task, kind):
+    result = invoke(*bench(task, kind))
+    assert result.exit_code == 3, result.output
+    assert isinstance(result.exception, SystemExit)
+    assert "1 of 1" in result.stderr
+    (row,) = json.loads((tmp_path / "out.json").read_text())
+    assert (row["raised"], row["success_rate"], row["strict_success_rate"]) == (1, 0.0, 0.0)
+    (error,) = row["errors"]
+    assert error["text"].isprintable()
+    files = (tmp_path / "out.tex", tmp_path / "out.md")
+    for text in (result.stdout, *(file.read_text() for file in files)):
+        assert any("!" in line and kind.__name__[:8] in line for line in text.splitlines())
+        assert "raised and count as failures" in " ".join(text.split())
+
+
+@pytest.mark.parametrize("kind", [strangers.Raises, strangers.Leaves, strangers.NotANumber])
+@pytest.mark.parametrize(("command", "task"), EVERYWHERE)
+def test_every_command_says_so_and_ends_with_status_3(invoke, tmp_path, command, task, kind):
+    result = invoke(*COMMANDS[command](task, kind))
+    assert result.exit_code == 3, result.output
+    assert isinstance(result.exception, SystemExit)
+    assert "failure" in result.output
+    assert list(tmp_path.iterdir())  # what was asked for is written all the same
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_what_a_policy_does_to_its_observations_changes_nothing(task, jobs):
+    more = {"agents": (2,), "safety_filter": "none"} if task == "spacecraft" else {}
+
+    def flown(kind):
+        settings = BenchmarkSettings.for_task(
+            task, policies=(name_of(kind),), episodes=2, bounds=(0.3,), jobs=jobs, chunk=1, **more
+        )
+        (episodes,) = run_benchmark(settings).episodes.values()
+        return episodes
+
+    for one, two in zip(flown(strangers.Calm), flown(strangers.Writes), strict=True):
+        assert one.error is two.error is None
+        if task == "cartpole":
+            assert one.effort == two.effort
+            np.testing.assert_array_equal(one.tracking_error, two.tracking_error)
+        else:
+            assert one == two
+
+
+def test_counters_that_raise_fail_their_episode(invoke, tmp_path):
+    result = invoke(*bench("cartpole", strangers.BadCounters))
+    assert result.exit_code == 3
+    (row,) = json.loads((tmp_path / "out.json").read_text())
+    assert row["errors"][0]["text"] == "KeyError: 'plans'"
+
+
+def test_only_an_interrupt_passes_an_attempt():
+    for error in (ValueError("one"), SystemExit(0), GeneratorExit(), StopIteration()):
+        with Attempt() as attempt:
+            raise error
+        assert attempt.error == describe_error(error)
+    with pytest.raises(KeyboardInterrupt), Attempt():
+        raise KeyboardInterrupt
+    with pytest.raises(AnswerError), Attempt(AnswerError):
+        raise AnswerError
+    with Attempt() as attempt:
+        pass
+    assert attempt.error is None
+
+
+def test_a_text_is_one_line_that_can_be_printed():
+    long = describe_error(ValueError("x\r\n\ty\x07\ud800" + "z" * 2000))
+    assert long.isprintable()
+    assert long.startswith("ValueError: x y\\x07\\ud800zzz")
+    assert len(long) < 600
+
+
+def test_an_answer_is_a_copy_of_the_right_shape():
+    class Reuses(strangers.Calm):
+        buffer = np.zeros((2, 8))
+
+        def answer(self, seen, zero):
+            return self.buffer, None
+
+    policy = Reuses(None, preset=None)
+    seen = np.zeros((2, 20))
+    answer = ask(policy, seen, None, [True, True], (2, 8))
+    policy.buffer[:] = 7.0
+    assert answer.action.dtype == np.float32
+    assert not answer.action.any()
+    with pytest.raises(AnswerError, match=r"by an action of shape \(2, 8\); it must be \(3, 8\)"):
+        ask(policy, seen, None, [True, True], (3, 8))
