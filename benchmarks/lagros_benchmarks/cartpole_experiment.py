@@ -25,7 +25,7 @@ from lagros_benchmarks.library import (
     describe_error,
 )
 from lagros_benchmarks.settings import BenchmarkSettings, Case, Condition
-from lagros_benchmarks.workers import Progress, gather, split
+from lagros_benchmarks.workers import Keeper, Progress, gather, split
 
 _FORWARD_CALLS = 2000
 _CALM = Condition("none", 0.0)
@@ -112,9 +112,9 @@ class CartPoleExperiment:
         """Whether workers contend for the processor."""
         return self.settings.backend.in_parallel(self.settings.jobs)
 
-    def units(self, progress: Progress | None) -> list[NominalPlan]:
+    def units(self, progress: Progress | None, keeper: Keeper | None = None) -> list[NominalPlan]:
         """Return the nominal plan of every episode."""
-        return plan_nominals(self.settings, self.toolbox, progress)
+        return plan_nominals(self.settings, self.toolbox, progress, keeper)
 
     def play(self, case: Case, units: Sequence[NominalPlan]) -> list[EpisodeRecord]:
         """Run episodes one after the other and return their records."""
@@ -185,7 +185,10 @@ def make_policy(
 
 
 def plan_nominals(
-    settings: BenchmarkSettings, toolbox: Toolbox, progress: Progress | None = None
+    settings: BenchmarkSettings,
+    toolbox: Toolbox,
+    progress: Progress | None = None,
+    keeper: Keeper | None = None,
 ) -> list[NominalPlan]:
     """Plan x_d of every episode once: it depends on the scenario alone."""
     chunks = list(split(settings.episode_seeds(), settings.chunk))
@@ -193,7 +196,7 @@ def plan_nominals(
     def work(seeds: Sequence[int]) -> list[NominalPlan]:
         return _plan_chunk(settings, toolbox, seeds)
 
-    planned = gather("planning", work, chunks, settings.jobs, progress, settings.backend)
+    planned = gather("planning", work, chunks, settings.jobs, progress, settings.backend, keeper)
     return [plan for part in planned for plan in part]
 
 

@@ -19,7 +19,9 @@ from lagros_benchmarks.data import data
 from lagros_benchmarks.export import export
 from lagros_benchmarks.extras import check_extra
 from lagros_benchmarks.outputs import policy_files
+from lagros_benchmarks.streams import printing_failed
 from lagros_benchmarks.terminal import (
+    INTERRUPTED,
     Commands,
     fail,
     find_users_modules,
@@ -32,13 +34,14 @@ from lagros_benchmarks.train import train
 from lagros_benchmarks.watch import watch
 
 if TYPE_CHECKING:
+    from lagros_benchmarks.keeping import Kept
     from lagros_benchmarks.records import Row
     from lagros_benchmarks.report import Outputs
     from lagros_benchmarks.reproduction import Reproduction
     from lagros_benchmarks.settings import BenchmarkSettings
     from lagros_policies.backends import Backend
 
-DEMO_FOLDER = Path("runs/demo")
+BENCH_FOLDER, DEMO_FOLDER = Path("runs/bench"), Path("runs/demo")
 # The paper's experiment: the default policies, 50 episodes, uniform disturbance.
 DEMO: dict[str, Any] = {"episodes": 50, "disturbances": ("uniform",), "bounds": (0.75,)}
 
@@ -146,6 +149,15 @@ def bench(
     episodes_file: Annotated[
         Path | None, _file("Every episode (every agent), as JSON Lines.")
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            file_okay=False,
+            help="Keeps finished work, with which the same command goes on where it was killed. "
+            f"If left out it is {BENCH_FOLDER}, and emptied at the end.",
+        ),
+    ] = None,
 ) -> None:
     """Compare policies on the same episodes; print the table, write what is asked for.
 
@@ -181,10 +193,10 @@ def bench(
         )
         for name in settings.policies:
             check_policy(name, task)
-        outputs.check(task, settings.episodes, policy_files(settings.policies))
+        outputs.check(task, settings.episodes, policy_files(settings.policies), {"--out": out})
     except ValueError as error:
         fail(error)
-    run_and_report(settings, outputs)
+    run_and_report(settings, outputs, out or BENCH_FOLDER, keep=out is not None)
 
 
 @app.command()
@@ -198,7 +210,7 @@ def demo() -> None:
         outputs.check()
     except ValueError as error:
         fail(error)
-    run_and_report(BenchmarkSettings(**DEMO), outputs)
+    run_and_report(BenchmarkSettings(**DEMO), outputs, DEMO_FOLDER)
 
 
 @app.command()
@@ -247,7 +259,7 @@ def reproduce(
         fail(error)
     except (ImportError, BackendError) as error:
         fail(error, status=1)
-    run_and_report(benchmark, outputs)
+    run_and_report(benchmark, outputs, place / "benchmark", keep=True)
 
 
 def _reproduction(task: str, episodes: int | None, jobs: int, backend: Backend) -> Reproduction:
@@ -281,12 +293,16 @@ app.command()(attack)
 app.add_typer(data, name="data")
 
 
-def run_and_report(settings: BenchmarkSettings, outputs: Outputs) -> list[Row]:
+def run_and_report(
+    settings: BenchmarkSettings, outputs: Outputs, folder: Path, keep: bool = False
+) -> list[Row]:
     """Run a benchmark with a progress bar, write its files and print its table.
 
     Args:
         settings: What to run.
         outputs: What to write.
+        folder: Keeps finished work until the run is complete and its results are safe.
+        keep: Whether the work stays there even then.
 
     Returns:
         The rows.
@@ -299,22 +315,40 @@ def run_and_report(settings: BenchmarkSettings, outputs: Outputs) -> list[Row]:
     from lagros_benchmarks.library import SetupError
     from lagros_benchmarks.records import summarise
     from lagros_benchmarks.report import print_report
-    from lagros_benchmarks.runner import run_benchmark
+    from lagros_benchmarks.runner import kept_in, run_benchmark
+    from lagros_envs.files import remove_folders
     from lagros_policies.backends import BackendError
 
+    kept = kept_in(folder, settings)
+    if len(kept):
+        progress_line(f"going on with {len(kept)} finished chunks of {kept.folder}")
     try:
         # What policies print is not ours.
         with progress_bar() as progress, redirect_stdout(sys.stderr):
-            run = run_benchmark(settings, progress=progress)
+            run = run_benchmark(settings, progress=progress, kept=kept)
     except (SetupError, BackendError) as error:
         # No weights, damaged weights, an extra that is not installed, a cluster that is not there.
         fail(error, status=1)
+    except KeyboardInterrupt:
+        fail(f"interrupted{_where_kept(kept)}", status=INTERRUPTED)
     rows = summarise(run)
     delivery = outputs.write(run, rows)
     print_report(rows)
+    if delivery.problems or not (delivery.written or printing_failed() is None):
+        progress_line(f"lagros: something was not written or printed{_where_kept(kept)}")
+    elif not keep:
+        kept.remove()
+        if folder == BENCH_FOLDER:
+            remove_folders((folder.parent, folder))
     delivery.tell()
     if any(row["raised"] for row in rows):
         raised = [(row["policy"], row["raised"], row["episodes"]) for row in rows if row["raised"]]
         typer.echo(f"lagros: {raised_line(raised)}", err=True)
         raise typer.Exit(RAISED)
     return rows
+
+
+def _where_kept(kept: Kept) -> str:
+    if not len(kept):
+        return ""
+    return f"; all that is finished is kept in {kept.folder}, and the same command goes on there"

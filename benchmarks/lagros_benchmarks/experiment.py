@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from lagros_benchmarks.settings import BenchmarkSettings, Case
-from lagros_benchmarks.workers import Progress
+from lagros_benchmarks.workers import Keeper, Progress
 
 __all__ = ["BenchmarkRun", "Experiment", "Progress", "Row"]
 
@@ -44,8 +44,8 @@ class Experiment(Protocol):
         """Whether the step times need a serial pass of their own."""
         ...
 
-    def units(self, progress: Progress | None) -> list[Any]:
-        """Return one unit per episode, the same for every case."""
+    def units(self, progress: Progress | None, keeper: Keeper | None = None) -> list[Any]:
+        """Return one unit per episode, the same for every case; see `gather` for the keeper."""
         ...
 
     def play(self, case: Case, units: Sequence[Any]) -> Any:

@@ -19,14 +19,18 @@ if TYPE_CHECKING:
 
 # What a command asks for or reads, by the option that names it; None where it is left out.
 Paths = Mapping[str, Path | None]
+_ANY = ".lagros"  # a name that no file of ours has
 
 
-def check_outputs(outputs: Paths, inputs: Paths | None = None) -> None:
+def check_outputs(
+    outputs: Paths, inputs: Paths | None = None, folders: Paths | None = None
+) -> None:
     """Check by trying that all files of a command can be written, and make their folders.
 
     Args:
         outputs: What the command writes.
         inputs: What it reads, and must not write over.
+        folders: Where it writes files of its own choice.
 
     Raises:
         ValueError: One cannot be written, two are one file, or one is what the command reads.
@@ -39,21 +43,24 @@ def check_outputs(outputs: Paths, inputs: Paths | None = None) -> None:
             status = path.stat()
             seen[status.st_dev, status.st_ino] = f"what {option} reads"
     made: tuple[Path, ...] = ()
-    for option, path in outputs.items():
-        if path is None:
-            continue
-        try:
-            found = _writable(option, path)
+    try:
+        for option, path in outputs.items():
+            if path is None:
+                continue
+            found = _writable(option, path, path)
             made += found.made
             if found.place in seen:
                 raise ValueError(
                     f"{option}: {str(path)!r} is {seen[found.place]}, too; name another file"
                 )
-        except ValueError:
-            remove_folders(made)
-            raise
-        if found.place is not None:
-            seen[found.place] = f"the file of {option}"
+            if found.place is not None:
+                seen[found.place] = f"the file of {option}"
+        for option, path in (folders or {}).items():
+            if path is not None:
+                made += _writable(option, path / _ANY, path).made
+    except ValueError:
+        remove_folders(made)
+        raise
 
 
 def policy_files(policies: Iterable[str]) -> dict[str, Path]:
@@ -62,14 +69,14 @@ def policy_files(policies: Iterable[str]) -> dict[str, Path]:
     return {f"the policy {path}": path for path in paths if path.suffix == ".zip"}
 
 
-def _writable(option: str, path: Path) -> Writable:
+def _writable(option: str, path: Path, named: Path) -> Writable:
     from lagros_envs.files import check_writable
 
     try:
         return check_writable(path)
     except OSError as error:
         raise ValueError(
-            f"{option}: cannot write {str(path)!r}: {error.strerror}; name another file"
+            f"{option}: cannot write {str(named)!r}: {error.strerror or error}; name another"
         ) from error
 
 

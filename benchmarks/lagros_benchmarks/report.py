@@ -39,7 +39,11 @@ class Outputs:
     scene_world: int = 0
 
     def check(
-        self, task: str = "cartpole", episodes: int | None = None, inputs: Paths | None = None
+        self,
+        task: str = "cartpole",
+        episodes: int | None = None,
+        inputs: Paths | None = None,
+        folders: Paths | None = None,
     ) -> None:
         """Check the files before the run and not after it.
 
@@ -47,6 +51,7 @@ class Outputs:
             task: The task of the run.
             episodes: Its number of episodes; None leaves the scene's world unchecked.
             inputs: Files that the run reads, by the option that names them.
+            folders: Where it writes files of its own choice, likewise.
 
         Raises:
             ValueError: A file cannot be written, two are one, a figure has an unknown suffix, or
@@ -65,7 +70,7 @@ class Outputs:
                     f"scene_world={self.scene_world!r} must be one of the run's worlds, 0 to "
                     f"{episodes - 1}"
                 )
-        check_outputs(self._paths, inputs)
+        check_outputs(self._paths, inputs, folders)
 
     @property
     def some(self) -> bool:

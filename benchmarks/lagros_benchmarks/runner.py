@@ -7,10 +7,13 @@ one process runs them or many. What depends on the task is an `Experiment`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from lagros_benchmarks.cartpole_experiment import CartPoleExperiment
 from lagros_benchmarks.experiment import BenchmarkRun, Experiment
+from lagros_benchmarks.fingerprints import fingerprint
+from lagros_benchmarks.keeping import Kept
 from lagros_benchmarks.library import Toolbox
 from lagros_benchmarks.settings import BenchmarkSettings, Case
 from lagros_benchmarks.spacecraft_experiment import Scene, SpacecraftExperiment
@@ -18,7 +21,15 @@ from lagros_benchmarks.spacecraft_experiment import fly_scene as fly_world
 from lagros_benchmarks.workers import Progress, gather, split
 from lagros_policies.backends import running
 
-__all__ = ["BenchmarkRun", "Case", "Progress", "fly_scene", "make_experiment", "run_benchmark"]
+__all__ = [
+    "BenchmarkRun",
+    "Case",
+    "Progress",
+    "fly_scene",
+    "kept_in",
+    "make_experiment",
+    "run_benchmark",
+]
 
 
 def make_experiment(settings: BenchmarkSettings, toolbox: Toolbox | None = None) -> Experiment:
@@ -33,10 +44,27 @@ def make_experiment(settings: BenchmarkSettings, toolbox: Toolbox | None = None)
     return SpacecraftExperiment.set_up(settings, toolbox)
 
 
+def kept_in(
+    folder: Path | str, settings: BenchmarkSettings, toolbox: Toolbox | None = None
+) -> Kept:
+    """Return the finished chunks of a run of these settings, in a folder of its own.
+
+    Runs of other settings, policies, weights or versions have others, so that all may share one.
+
+    Args:
+        folder: Holds the folders of runs; need not be there.
+        settings: Those of the run.
+        toolbox: As for `run_benchmark`.
+    """
+    key = fingerprint(settings, toolbox or Toolbox())
+    return Kept(Path(folder) / f"{settings.task}-{key[:16]}", key)
+
+
 def run_benchmark(
     settings: BenchmarkSettings,
     toolbox: Toolbox | None = None,
     progress: Progress | None = None,
+    kept: Kept | None = None,
 ) -> BenchmarkRun:
     """Run every policy under every condition on the same episodes.
 
@@ -44,6 +72,9 @@ def run_benchmark(
         settings: What to run.
         toolbox: Where policies and plans come from; `lagros_policies` if None.
         progress: Called after every chunk of work.
+        kept: Has the chunks that an earlier run of the same settings has finished, and takes those
+            that this one finishes; see `kept_in`. All but the times is the same with it, to the
+            bit.
 
     Returns:
         All episodes.
@@ -56,11 +87,11 @@ def run_benchmark(
     experiment = make_experiment(settings, toolbox)
     cases = settings.cases
     with running(settings.backend, settings.jobs):
-        units = experiment.units(progress)
-        outcomes = _play_cases(experiment, settings, cases, units, progress)
+        units = experiment.units(progress, kept)
+        outcomes = _play_cases(experiment, settings, cases, units, progress, kept)
     timing = None
     if experiment.timed_apart:
-        timing = _time_cases(experiment, settings, cases, units, progress)
+        timing = _time_cases(experiment, settings, cases, units, progress, kept)
     return experiment.finish(units, outcomes, timing)
 
 
@@ -84,6 +115,7 @@ def _play_cases(
     cases: Sequence[Case],
     units: Sequence[Any],
     progress: Progress | None,
+    kept: Kept | None,
 ) -> dict[Case, list[Any]]:
     chunks = [(case, part) for case in cases for part in split(units, settings.chunk)]
 
@@ -91,7 +123,7 @@ def _play_cases(
         return experiment.play(*chunk)
 
     outcomes: dict[Case, list[Any]] = {case: [] for case in cases}
-    played = gather("episodes", work, chunks, settings.jobs, progress, settings.backend)
+    played = gather("episodes", work, chunks, settings.jobs, progress, settings.backend, kept)
     for (case, _), outcome in zip(chunks, played, strict=True):
         outcomes[case].append(outcome)
     return outcomes
@@ -103,8 +135,11 @@ def _time_cases(
     cases: Sequence[Case],
     units: Sequence[Any],
     progress: Progress | None,
+    kept: Kept | None,
 ) -> dict[Case, Any]:
     """Run the first episodes again, in this process alone."""
     first = units[: settings.timing_episodes]
-    timed = gather("timing", lambda case: experiment.time(case, first), cases, 1, progress)
+    timed = gather(
+        "timing", lambda case: experiment.time(case, first), cases, 1, progress, keeper=kept
+    )
     return dict(zip(cases, timed, strict=True))

@@ -23,7 +23,7 @@ from lagros_benchmarks.spacecraft_episodes import (
     rehearse_in,
 )
 from lagros_benchmarks.spacecraft_timing import PLAN_WORLDS, Timing, time_plans, time_policy
-from lagros_benchmarks.workers import Progress
+from lagros_benchmarks.workers import Keeper, Progress
 from lagros_envs.scenarios import Scenario
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
 
@@ -143,7 +143,7 @@ class SpacecraftExperiment:
         with building(f"policy {name!r} with the safety filter"):
             return self.toolbox.make_filter(policy, env, bound)
 
-    def units(self, progress: Progress | None) -> list[int]:
+    def units(self, progress: Progress | None, keeper: Keeper | None = None) -> list[int]:
         """Return the seed of every world: each policy plans for itself."""
         return self.settings.episode_seeds()
 

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from lagros_benchmarks.training.settings import Training
 
 RUNS = Path("runs/train")
+# Files of a run, see `training.run.Place`.
+KEPT = ("record.json", "weights.safetensors", "checkpoint.pt")
 
 
 def train(
@@ -95,8 +97,12 @@ def train(
             from lagros_benchmarks.canvas import check_figure_path
 
             check_figure_path(figure)
-        places = {f"--out (seed {run.seed})": folder_of(run, out) / "record.json" for run in runs}
-        check_outputs({"--json": json, "--figure": figure, **places})
+        places = [folder_of(run, out) for run in runs]
+        check_outputs(
+            {"--json": json, "--figure": figure},
+            {f"the run in {place}": place / name for place in places for name in KEPT},
+            {f"--out, seed {run.seed}": folder_of(run, out) for run in runs},
+        )
     except ValueError as error:
         fail(error)
     _say_what_happens()

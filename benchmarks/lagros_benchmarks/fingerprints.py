@@ -1,0 +1,103 @@
+"""What the chunks of a benchmark depend on, as one number."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from lagros_benchmarks.library import Toolbox
+from lagros_benchmarks.settings import BenchmarkSettings
+from lagros_benchmarks.surroundings import machine, threads, versions
+
+_PACKAGES = ("lagros_envs", "lagros_policies", "lagros_benchmarks")
+# What changes no result; whether the work is done in parallel does, for it decides what is timed.
+_FREE = ("jobs", "backend")
+
+
+def fingerprint(settings: BenchmarkSettings, toolbox: Toolbox) -> str:
+    """Return a hash of all that the chunks of a run depend on.
+
+    These are the settings, the content of the files and modules that they name, our own code and
+    weights, the versions of what is installed, the threads and the processor: the last digit of a
+    product may depend on each.
+
+    Args:
+        settings: Those of the run.
+        toolbox: Where its policies and plans come from.
+    """
+    record = {name: value for name, value in asdict(settings).items() if name not in _FREE}
+    made_by = machine()
+    depends = {
+        "settings": record,
+        "parallel": settings.backend.in_parallel(settings.jobs),
+        "files": {text: _digest(files) for text, files in _named_files(record)},
+        "code": _own_code(),
+        "toolbox": [_origin(value) for value in vars(toolbox).values()],
+        "versions": versions(),
+        "threads": {name: value for name, value in threads().items() if name != "torch"},
+        "machine": [made_by["platform"], made_by["processor"]],
+    }
+    text = json.dumps(depends, sort_keys=True, default=repr)
+    return hashlib.sha256(text.encode(errors="backslashreplace")).hexdigest()
+
+
+def _named_files(value: Any) -> Iterator[tuple[str, list[Path]]]:
+    """Yield each text among some settings that names a file or a module, with its files."""
+    if isinstance(value, Mapping):
+        for item in (*value.keys(), *value.values()):
+            yield from _named_files(item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _named_files(item)
+    elif isinstance(value, str | Path):
+        text = str(value)
+        before, colon, after = text.rpartition(":")
+        if colon and not Path(after).is_file():
+            yield text, _module_files(before)
+        elif Path(after).is_file():
+            yield text, [Path(after)]
+
+
+def _module_files(module: str) -> list[Path]:
+    """Return the files of a module, and those beside it, which it may import."""
+    try:
+        found = importlib.util.find_spec(module.partition(".")[0])
+    except (ImportError, ValueError):
+        return []
+    if found is None:
+        return []
+    if found.submodule_search_locations:
+        return [path for place in found.submodule_search_locations for path in _files(Path(place))]
+    return [] if found.origin is None else sorted(Path(found.origin).parent.glob("*.py"))
+
+
+def _files(folder: Path) -> list[Path]:
+    found = (path for path in folder.rglob("*") if "__pycache__" not in path.parts)
+    return sorted(path for path in found if path.is_file())
+
+
+@cache
+def _own_code() -> str:
+    return _digest(path for package in _PACKAGES for path in _module_files(package))
+
+
+def _digest(paths: Iterable[Path]) -> str:
+    digest = hashlib.sha256()
+    for path in paths:
+        try:
+            content = path.read_bytes()
+        except OSError:  # what nobody can read changes no result
+            continue
+        digest.update(f"{path.name} {len(content)} ".encode(errors="backslashreplace"))
+        digest.update(content)
+    return digest.hexdigest()
+
+
+def _origin(function: Any) -> str:
+    return f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', '')}"
