@@ -5,7 +5,8 @@ They run in NumPy: neither torch nor a pickle is loaded. `lagros train cartpole`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from lagros_envs import cartpole_task as task
 from lagros_envs.checks import check_positive
 from lagros_policies.imitation.networks import Mlp, read_safetensors, write_safetensors
+from lagros_policies.trained_for import KEYS, cartpole_range, check_trained_for
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -52,6 +54,7 @@ class Actor:
         action_clip: Bound on the action, in the units of the training.
         force_scale: Force of the action 1.0 in the training [N].
         squash: How the action is bounded, "clip" or "tanh".
+        metadata: What `trained_for.weights_record` says of it; stored beside the arrays.
 
     Raises:
         ValueError: The shapes do not fit together or a value is out of range.
@@ -65,6 +68,7 @@ class Actor:
     action_clip: float
     force_scale: float
     squash: Squash = "clip"
+    metadata: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check shapes and values."""
@@ -99,6 +103,7 @@ class Actor:
             tensors[f"layer{index}.weight"] = weight
             tensors[f"layer{index}.bias"] = bias
         metadata = {
+            **self.metadata,
             "format": _FORMAT,
             "activation": "tanh",
             "squash": self.squash,
@@ -137,6 +142,7 @@ class Actor:
                 action_clip=float(metadata["action_clip"]),
                 force_scale=float(metadata["force_scale"]),
                 squash=squash,
+                metadata={name: metadata[name] for name in KEYS if name in metadata},
             )
         except KeyError as error:
             raise ValueError(f"{path} lacks the entry {error}") from error
@@ -151,29 +157,41 @@ class ActorPolicy:
         settings: The task; None for the paper's. Where its `force_scale` differs from that of the
             training, the action is rescaled so that the force stays the same.
         weights: A file written by `Actor.save`, or the actor itself; None for the shipped one.
+        allow_other_settings: Fly settings too for which the actor was not trained.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is damaged.
+        ValueError: The file is damaged, another policy's, or of a training for other settings.
 
     Attributes:
         actor: The arrays.
+        recorded_as: The policy that the file must name; None takes any.
     """
 
     name = "actor"
     weights_file = ""
+    recorded_as: str | None = None
+    restricted = True  # `policy.make` tells it whether other settings are allowed
     observes: Literal["local", "global"] = "local"
 
     def __init__(
         self,
         settings: task.CartPoleSettings | None = None,
         weights: Path | str | Actor | None = None,
+        allow_other_settings: bool = False,
     ) -> None:
         """Load the actor; see the class for the arguments."""
         self.settings = settings or task.CartPoleSettings()
-        if not isinstance(weights, Actor):
-            weights = Actor.load(PRETRAINED / self.weights_file if weights is None else weights)
-        self.actor = weights
+        file = PRETRAINED / self.weights_file if weights is None else weights
+        self.actor = weights = file if isinstance(file, Actor) else Actor.load(file)
+        check_trained_for(
+            weights.metadata,
+            "the actor" if isinstance(file, Actor) else str(file),
+            self.recorded_as,
+            self.settings,
+            cartpole_range(task.CartPoleSettings(), timed=False),
+            allow_other_settings,
+        )
         self._network = weights.network
         self._features = np.ascontiguousarray(weights.features.T)
         self._mean, self._std = weights.mean, weights.std
@@ -211,19 +229,19 @@ class ActorPolicy:
 class PpoPolicy(ActorPolicy):
     """The actor of proximal policy optimisation."""
 
-    name = "ppo"
+    name = recorded_as = "ppo"
     weights_file = "cartpole_ppo.safetensors"
 
 
 class SacPolicy(ActorPolicy):
     """The mean action of soft actor-critic."""
 
-    name = "sac"
+    name = recorded_as = "sac"
     weights_file = "cartpole_sac.safetensors"
 
 
 class Td3Policy(ActorPolicy):
     """The actor of twin delayed deep deterministic policy gradients."""
 
-    name = "td3"
+    name = recorded_as = "td3"
     weights_file = "cartpole_td3.safetensors"

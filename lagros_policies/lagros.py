@@ -9,12 +9,12 @@ from lagros_policies.imitation.spacecraft_policy import SpacecraftNetworkPolicy
 class LagrosPolicy(NetworkPolicy):
     """(x, o_l, t) -> u*: planner and tracking control in one evaluation."""
 
-    name = "lagros"
+    name = recorded_as = "lagros"
     weights_file = "cartpole_lagros.safetensors"
 
 
 class SpacecraftLagrosPolicy(SpacecraftNetworkPolicy):
     """o_l -> u* of each spacecraft from what it senses alone."""
 
-    name = "lagros"
+    name = recorded_as = "lagros"
     weights_file = "spacecraft_lagros.safetensors"

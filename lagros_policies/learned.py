@@ -9,12 +9,12 @@ from lagros_policies.imitation.spacecraft_policy import SpacecraftNetworkPolicy
 class LearnedPolicy(NetworkPolicy):
     """(x, o_l, t) -> u_d, trained on the target trajectories alone (Lemma 1)."""
 
-    name = "learned"
+    name = recorded_as = "learned"
     weights_file = "cartpole_learned.safetensors"
 
 
 class SpacecraftLearnedPolicy(SpacecraftNetworkPolicy):
     """o_l -> u_d of each spacecraft, learned on undisturbed plans."""
 
-    name = "learned"
+    name = recorded_as = "learned"
     weights_file = "spacecraft_learned.safetensors"

@@ -31,7 +31,7 @@ from lagros_policies.contraction.lagrangian import SlidingAxis, SlidingTracking
 from lagros_policies.contraction.metric import ContractionMetric
 from lagros_policies.contraction.neural.metric import load_neural_metric
 from lagros_policies.policy import PolicyState, row_memories
-from lagros_policies.tube_mpc import TubeMpcPolicy, TubeMpcState
+from lagros_policies.tube_mpc import TubeMpcPolicy, TubeMpcState, check_shipped_metric
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -52,6 +52,7 @@ class NeuralTubeMpcPolicy(TubeMpcPolicy):
         replan_every: Control steps between plans.
         deadline: Delta t_max, after which a plan is late [s].
         clock: Source of the time, for tests [s].
+        allow_other_settings: As in `TubeMpcPolicy`.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -67,8 +68,11 @@ class NeuralTubeMpcPolicy(TubeMpcPolicy):
         replan_every: int = 1,
         deadline: float = 0.1,
         clock: Callable[[], float] = perf_counter,
+        allow_other_settings: bool = False,
     ) -> None:
         """Read the network and build planner and law."""
+        if metric is None:
+            check_shipped_metric(settings or task.CartPoleSettings(), allow_other_settings)
         super().__init__(settings, load_neural_metric(metric), replan_every, deadline, clock)
 
 
@@ -101,6 +105,7 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
         replan_every: Control steps between plans.
         deadline: Delta t_max, after which a plan is late [s].
         clock: Source of the time, for tests [s].
+        allow_other_settings: As in `TubeMpcPolicy`.
 
     Raises:
         ValueError: A number is out of range.
@@ -115,9 +120,10 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
         replan_every: int = 1,
         deadline: float = 0.1,
         clock: Callable[[], float] = perf_counter,
+        allow_other_settings: bool = False,
     ) -> None:
         """Build planner, law and adaptation."""
-        super().__init__(settings, metric, replan_every, deadline, clock)
+        super().__init__(settings, metric, replan_every, deadline, clock, allow_other_settings)
         law = self.expert.law
         mass = cart_mass_regressor(law.system)
 

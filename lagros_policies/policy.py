@@ -10,7 +10,6 @@ from typing import Any, Literal, Protocol, cast, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_policies.wrappers import bare_environment
 
@@ -93,11 +92,19 @@ def row_memories(
     return [None if start else memory for memory, start in zip(memories, starts, strict=True)]
 
 
-def make(name: str, env: Any, allow_wrappers: bool = False, **settings: Any) -> Policy:
+def make(
+    name: str,
+    env: Any,
+    allow_wrappers: bool = False,
+    allow_other_settings: bool = False,
+    **settings: Any,
+) -> Policy:
     """Build a policy for an environment.
 
     A policy speaks the environment's own observations and actions, so that one within wrappers that
-    may change their meaning is refused; those that record, limit or render are looked through.
+    may change their meaning is refused; those that record, limit or render are looked through. What
+    was trained or designed flies the settings for which it was, as its file says; the paper's where
+    the file says nothing.
 
     Args:
         name: One of `NAMES` (`SPACECRAFT_NAMES` for the spacecraft); the path of a
@@ -109,6 +116,7 @@ def make(name: str, env: Any, allow_wrappers: bool = False, **settings: Any) -> 
             of one; the policy takes its task settings (and preset, and the bound of its
             disturbance) and nothing else.
         allow_wrappers: Look through every wrapper, as one of your own that changes neither.
+        allow_other_settings: Fly other settings too. Nothing that is said of the policy holds then.
         settings: Passed to the policy, e.g. `weights=path` or `metric=...`.
 
     Returns:
@@ -116,26 +124,25 @@ def make(name: str, env: Any, allow_wrappers: bool = False, **settings: Any) -> 
 
     Raises:
         ValueError: The name or the id is unknown, or a wrapper may change what an observation or
-            an action means.
+            an action means, or the weights are another policy's or were made for other settings.
         TypeError: The environment is not one of this package.
         ImportError: A package that the policy needs is not installed.
     """
     world = bare_environment(env, allow_wrappers)
-    task: CartPoleSettings | SpacecraftSettings = world.settings
-    if isinstance(task, SpacecraftSettings):
+    if isinstance(world.settings, SpacecraftSettings):
         classes = _SPACECRAFT
         settings = {"preset": world.preset, **settings}
     else:
         classes = _CARTPOLE
     if name in classes:
-        return _shipped(name, classes[name], task, world, settings)
+        return _shipped(name, classes[name], world, allow_other_settings, settings)
     if name.endswith(".zip"):
         from lagros_policies.sb3_model import load_stable_baselines3
 
         algorithm, _, path = name.rpartition(":")
         return load_stable_baselines3(path, algorithm or None, **settings)
     if ":" in name:
-        return _built(_class_named(name), task, world, settings)
+        return _built(_class_named(name), world, allow_other_settings, settings)
     near = difflib.get_close_matches(name, classes, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     raise ValueError(
@@ -145,17 +152,25 @@ def make(name: str, env: Any, allow_wrappers: bool = False, **settings: Any) -> 
 
 
 def _built(
-    policy: Callable[..., Policy], task: Any, world: Any, settings: dict[str, Any]
+    policy: Callable[..., Policy],
+    world: Any,
+    allow_other_settings: bool,
+    settings: dict[str, Any],
 ) -> Policy:
     if getattr(policy, "prepared", False):
         settings = {"disturbance_bound": world.disturbance.bound, **settings}
-    return policy(task, **settings)
+    if getattr(policy, "restricted", False):
+        settings = {"allow_other_settings": allow_other_settings, **settings}
+    return policy(world.settings, **settings)
 
 
-def _shipped(name: str, place: str, task: Any, world: Any, settings: dict[str, Any]) -> Policy:
+def _shipped(
+    name: str, place: str, world: Any, allow_other_settings: bool, settings: dict[str, Any]
+) -> Policy:
     module, _, attribute = place.partition(":")
     try:
-        return _built(getattr(importlib.import_module(module), attribute), task, world, settings)
+        kind = getattr(importlib.import_module(module), attribute)
+        return _built(kind, world, allow_other_settings, settings)
     except ModuleNotFoundError as error:
         raise ImportError(
             f"policy {name!r} needs {error.name}, which is not installed: "

@@ -20,6 +20,7 @@ class Correction(ActorPolicy):
     """The correction alone, an actor whose largest force is beta."""
 
     name = "correction"
+    recorded_as = "residual"
     weights_file = "cartpole_residual.safetensors"
 
 
@@ -34,10 +35,11 @@ class ResidualPolicy:
         settings: The task; None for the paper's.
         weights: File or arrays of the correction, an `Actor`; None for the shipped one.
         base: File of the network of LAG-ROS; None for the shipped one.
+        allow_other_settings: Fly settings too for which the networks were not trained.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: A file is damaged.
+        ValueError: A file is damaged, another policy's, or of a training for other settings.
 
     Attributes:
         base: The policy that is corrected.
@@ -45,6 +47,7 @@ class ResidualPolicy:
     """
 
     name = "residual"
+    restricted = True  # `policy.make` tells it whether other settings are allowed
     observes: Literal["local", "global"] = "local"
 
     def __init__(
@@ -52,11 +55,12 @@ class ResidualPolicy:
         settings: task.CartPoleSettings | None = None,
         weights: Path | str | Actor | None = None,
         base: Path | str | None = None,
+        allow_other_settings: bool = False,
     ) -> None:
         """Load both networks; see the class for the arguments."""
         self.settings = settings or task.CartPoleSettings()
-        self.base = LagrosPolicy(self.settings, base)
-        self.correction = Correction(self.settings, weights)
+        self.base = LagrosPolicy(self.settings, base, allow_other_settings)
+        self.correction = Correction(self.settings, weights, allow_other_settings)
 
     @property
     def largest_correction(self) -> float:

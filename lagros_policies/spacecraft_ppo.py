@@ -16,6 +16,7 @@ from lagros_policies.imitation.networks import Mlp
 from lagros_policies.policy import PolicyState
 from lagros_policies.sensed import Sensed
 from lagros_policies.spacecraft_setup import task_and_preset
+from lagros_policies.trained_for import check_trained_for, spacecraft_range
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -23,6 +24,7 @@ ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 
 WEIGHTS = Path(__file__).parent / "pretrained" / "spacecraft_ppo.safetensors"
+TRAINED_IN = ("paper",)  # its features count on the radii of this preset's bodies
 NEAREST = 3  # neighbours, and obstacles, that the agent looks at
 WRENCH = 3  # what it chooses: a force and a torque
 _OWN, _EACH = 5, 8
@@ -166,13 +168,15 @@ class SpacecraftPpoPolicy:
         preset: The preset, or its name, of the environment.
         num_agents: Number of agents; None for the preset's own.
         weights: The file of a training, or the network itself; None for the shipped one.
+        allow_other_settings: Fly settings and radii too for which the agent was not trained.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is damaged, or not this agent's.
+        ValueError: The file is damaged, not this agent's, or of a training for other settings.
     """
 
     name = "ppo"
+    restricted = True  # `policy.make` tells it whether other settings are allowed
     observes: Literal["local", "global"] = "local"
 
     def __init__(
@@ -181,18 +185,26 @@ class SpacecraftPpoPolicy:
         preset: str | Preset = "paper",
         num_agents: int | None = None,
         weights: Path | str | Mlp | None = None,
+        allow_other_settings: bool = False,
     ) -> None:
         """Load the actor."""
         self.settings, chosen = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(chosen, self.settings)
-        if not isinstance(weights, Mlp):
-            weights = Mlp.load(WEIGHTS if weights is None else weights)
-        self.network = weights
+        file = WEIGHTS if weights is None else weights
+        self.network = file if isinstance(file, Mlp) else Mlp.load(file)
         if (self.network.inputs, self.network.outputs) != (FEATURES, WRENCH):
             raise ValueError(
                 f"the network maps {self.network.inputs} numbers to {self.network.outputs}; this "
                 f"agent maps {FEATURES} to {WRENCH}; `lagros train spacecraft` makes such a network"
             )
+        check_trained_for(
+            self.network.metadata,
+            "the network" if isinstance(file, Mlp) else str(file),
+            self.name,
+            (self.settings, chosen),
+            spacecraft_range(task.SpacecraftSettings(), TRAINED_IN),
+            allow_other_settings,
+        )
 
     def predict(
         self,

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
 from lagros_envs.checks import check_above, check_whole
+from lagros_envs.dynamics import CartPole
 from lagros_policies.contraction import ContractionMetric, load_metric
 from lagros_policies.expert import CartPoleExpert, TrackedPlans
 from lagros_policies.planning import Trajectory
 from lagros_policies.policy import PolicyState, row_memories
+from lagros_policies.trained_for import cartpole_design, check_trained_for
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -62,12 +64,16 @@ class TubeMpcPolicy:
         replan_every: Control steps between plans.
         deadline: Delta t_max, after which a plan is late [s].
         clock: Source of the time, for tests [s].
+        allow_other_settings: Track with the shipped metric also where the cart-pole is another than
+            that for which it was designed.
 
     Raises:
-        ValueError: `replan_every` is less than one or the deadline is not positive.
+        ValueError: `replan_every` is less than one, the deadline is not positive, or the cart-pole
+            is another.
     """
 
     name = "tube-mpc"
+    restricted = True  # `policy.make` tells it whether other settings are allowed
     observes: Literal["local", "global"] = "local"
 
     def __init__(
@@ -77,11 +83,14 @@ class TubeMpcPolicy:
         replan_every: int = 1,
         deadline: float = 0.1,
         clock: Callable[[], float] = time.perf_counter,
+        allow_other_settings: bool = False,
     ) -> None:
         """Build planner and law."""
         check_whole("replan_every", replan_every)
         check_above("deadline", deadline, 0)
         self.settings = settings or task.CartPoleSettings()
+        if metric is None:
+            check_shipped_metric(self.settings, allow_other_settings)
         if metric is None or isinstance(metric, str | Path):
             metric = load_metric(metric)
         self.expert = CartPoleExpert(metric, self.settings)
@@ -147,6 +156,16 @@ class TubeMpcPolicy:
             return
         memory.plan = renewed
         memory.tracked = self.expert.track(renewed.states[None], renewed.controls[None], step)
+
+
+def check_shipped_metric(settings: task.CartPoleSettings, allow_other_settings: bool) -> None:
+    """Check that the shipped metric was designed for the task's cart-pole.
+
+    Raises:
+        ValueError: It was designed for another, and no other is allowed.
+    """
+    made_for = cartpole_design(CartPole())
+    check_trained_for({}, "the shipped metric", None, settings, made_for, allow_other_settings)
 
 
 def _confirms(renewed: Trajectory, plan: Trajectory) -> bool:

@@ -29,6 +29,7 @@ from lagros_policies.imitation.features import FEATURES, cartpole_features
 from lagros_policies.imitation.networks import Mlp
 from lagros_policies.imitation.train import TrainingSettings, fit, learning_error
 from lagros_policies.metric_design import MetricDesignSettings, design_cartpole_metric
+from lagros_policies.trained_for import cartpole_range, weights_record
 
 Float32Array = NDArray[np.float32]
 
@@ -179,7 +180,9 @@ def _network(
             folder / f"{name}_checkpoint.safetensors",
             lambda epoch, _: update(f"train {name}", epoch, training.epochs),
         )
-        network.metadata.update(policy=name, task="cartpole", inputs=", ".join(FEATURES))
+        trained_for = cartpole_range(CartPoleSettings(), timed=True)
+        network.metadata.update(weights_record("cartpole", name, trained_for))
+        network.metadata["inputs"] = ", ".join(FEATURES)
         network.save(weights)
     error = learning_error(Mlp.load(weights), features[held_out], labels[held_out])
     record: dict[str, Any] = {

@@ -35,6 +35,7 @@ from lagros_policies.imitation.train_deep_set import (
 )
 from lagros_policies.sensed import Sensed
 from lagros_policies.spacecraft_expert import SpacecraftExpertSettings
+from lagros_policies.trained_for import PUBLISHED, spacecraft_range, weights_record
 
 BOUNDS = (0.2, 0.4, 0.6, 0.8, 1.0)
 _RELABELLED = "relabelled"
@@ -188,7 +189,8 @@ class _Stage:
                 self.folder / f"{name}_checkpoint.safetensors",
                 lambda epoch, _: self.progress(f"fit {name}", epoch, training.epochs),
             )
-            network.metadata.update(policy=name, task="spacecraft")
+            trained_for = spacecraft_range(self.task, PUBLISHED)
+            network.metadata.update(weights_record("spacecraft", name, trained_for))
             network.save(weights)
         fitted = DeepSet.load(weights)
         error = _learning_error(fitted, self._samples(test))

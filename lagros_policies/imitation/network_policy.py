@@ -12,6 +12,7 @@ from lagros_envs import cartpole_task as task
 from lagros_policies.imitation.features import FEATURES, cartpole_features
 from lagros_policies.imitation.networks import Mlp
 from lagros_policies.policy import PolicyState
+from lagros_policies.trained_for import cartpole_range, check_trained_for
 
 Float32Array = NDArray[np.float32]
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
@@ -23,18 +24,28 @@ class NetworkPolicy:
     Args:
         settings: The task; it fixes the unit of the action.
         weights: A safetensors file written by `Mlp.save`; the shipped one if left out.
+        allow_other_settings: Fly settings too for which the network was not trained.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is damaged, or its network has other inputs.
+        ValueError: The file is damaged, its network has other inputs, is another policy's, or was
+            trained for other settings.
+
+    Attributes:
+        recorded_as: The policy that the file must name; None takes any.
     """
 
     name: str
     weights_file: str
+    recorded_as: str | None = None
+    restricted = True  # `policy.make` tells it whether other settings are allowed
     observes: Literal["local", "global"] = "local"
 
     def __init__(
-        self, settings: task.CartPoleSettings | None = None, weights: Path | str | None = None
+        self,
+        settings: task.CartPoleSettings | None = None,
+        weights: Path | str | None = None,
+        allow_other_settings: bool = False,
     ) -> None:
         """Load the network."""
         self.settings = settings or task.CartPoleSettings()
@@ -45,6 +56,14 @@ class NetworkPolicy:
                 f"{path} has {self.network.inputs} inputs and {self.network.outputs} outputs; "
                 f"a cart-pole network has {len(FEATURES)} and 1"
             )
+        check_trained_for(
+            self.network.metadata,
+            str(path),
+            self.recorded_as,
+            self.settings,
+            cartpole_range(task.CartPoleSettings(), timed=True),
+            allow_other_settings,
+        )
         self._unit = np.float32(1.0 / self.settings.force_scale)
 
     def predict(

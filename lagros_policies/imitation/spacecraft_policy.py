@@ -18,6 +18,7 @@ from lagros_policies.imitation.spacecraft_features import SpacecraftFeatures, sp
 from lagros_policies.policy import PolicyState
 from lagros_policies.sensed import Sensed
 from lagros_policies.spacecraft_setup import task_and_preset
+from lagros_policies.trained_for import PUBLISHED, check_trained_for, spacecraft_range
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -35,14 +36,21 @@ class SpacecraftNetworkPolicy:
         preset: The preset, or its name: the size of observations and the radii of the bodies.
         num_agents: Number of agents; None for the preset's own.
         weights: A safetensors file written by `DeepSet.save`; the shipped one if left out.
+        allow_other_settings: Fly settings and radii too for which the network was not trained.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is damaged, or its network is another one.
+        ValueError: The file is damaged, its network is another one or another policy's, or was
+            trained for other settings.
+
+    Attributes:
+        recorded_as: The policy that the file must name; None takes any.
     """
 
     name: str = "network"
     weights_file: str
+    recorded_as: str | None = None
+    restricted = True  # `policy.make` tells it whether other settings are allowed
     observes: Literal["local", "global"] = "local"
 
     def __init__(
@@ -51,11 +59,21 @@ class SpacecraftNetworkPolicy:
         preset: str | Preset = "paper",
         num_agents: int | None = None,
         weights: Path | str | None = None,
+        allow_other_settings: bool = False,
     ) -> None:
         """Load the network."""
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
-        self.network = DeepSet.load(PRETRAINED / self.weights_file if weights is None else weights)
+        path = PRETRAINED / self.weights_file if weights is None else weights
+        self.network = DeepSet.load(path)
+        check_trained_for(
+            self.network.metadata,
+            str(path),
+            self.recorded_as,
+            (self.settings, self.preset),
+            spacecraft_range(task.SpacecraftSettings(), PUBLISHED),
+            allow_other_settings,
+        )
         self._radii = self.preset.agent_radius, self.preset.core
 
     def predict(

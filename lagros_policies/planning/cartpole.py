@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,14 +30,18 @@ class CartPolePlannerSettings:
     Attributes:
         angle_margin: Steady margin of the angle [rad].
         margin_rate: Rate at which the margin grows from zero [1/s].
+        force_share: Where the task has a force limit, the share of it that plans use; the rest is
+            for u*.
         scp: How to iterate.
 
     Raises:
-        ValueError: The margin leaves no admissible angle, or the rate is not positive.
+        ValueError: The margin leaves no admissible angle, the rate is not positive, or the share is
+            not in (0, 1].
     """
 
     angle_margin: float = 0.4
     margin_rate: float = 0.6
+    force_share: float = 1.0
     scp: ScpSettings = field(default_factory=ScpSettings)
 
     def __post_init__(self) -> None:
@@ -45,13 +50,15 @@ class CartPolePlannerSettings:
         if not 0.0 <= self.angle_margin < FALL_ANGLE:
             raise ValueError(f"angle_margin={self.angle_margin!r} must be in [0, pi/2)")
         check_positive("margin_rate", self.margin_rate)
+        if not 0.0 < self.force_share <= 1.0:
+            raise ValueError(f"force_share={self.force_share!r} must be in (0, 1]")
 
 
 class CartPolePlanner:
     """Plans (x_d, u_d) of least effort that ends at the goal at the time limit.
 
     Args:
-        task: The task; its system, period and time limit are planned for.
+        task: The task; its system, period, time limit and force limit are planned for.
         settings: The tightening and the iteration.
     """
 
@@ -63,7 +70,11 @@ class CartPolePlanner:
         """Remember task and settings."""
         self.task = task or CartPoleSettings()
         self.settings = settings or CartPolePlannerSettings()
-        self._solver = ScpSolver(self.task.system, self.task.control_period, self.settings.scp)
+        problem = self.task.system, self.task.control_period, self.settings.scp
+        self._solver = ScpSolver(*problem)
+        limit = self.task.force_limit
+        self._largest = math.inf if limit is None else self.settings.force_share * limit
+        self._limited = ScpSolver(*problem, self._largest)
 
     def angle_limit(self, time: FloatArray) -> FloatArray:
         """Return the tightened bound of |theta_d| [rad] at the times [s] (Theorem 3)."""
@@ -113,6 +124,9 @@ class CartPolePlanner:
         warm = None
         if guess is not None:
             warm = guess.states[-(horizon + 1) :], guess.controls[-horizon:]
-        return self._solver.solve(
-            np.asarray(initial_state, np.float64), np.asarray(goal, np.float64), -high, high, warm
-        )
+        ends = np.asarray(initial_state, np.float64), np.asarray(goal, np.float64)
+        plan = self._solver.solve(*ends, -high, high, warm)
+        if not plan.solved or np.max(np.abs(plan.controls)) <= self._largest:
+            return plan
+        # From a straight line the linearised dynamics may ask for more than the limit.
+        return self._limited.solve(*ends, -high, high, (plan.states, plan.controls))

@@ -1,15 +1,16 @@
 """Sequential convex programming with a trust region for least-effort trajectories.
 
 The problem is the paper's (19): min of the integral of ||u||^2 subject to the dynamics, a fixed
-initial state, a fixed terminal state and bounds on the states in between. Each pass linearises the
-held Runge-Kutta dynamics, solves one sparse quadratic program, and accepts the step if it lowers
-an exact penalty of the true problem. The defects are those of the true dynamics at every pass; the
-slopes come from a coarser Runge-Kutta step, which moves the limit by far less than the tolerance
-on effort and halves the cost of a pass.
+initial state, a fixed terminal state, bounds on the states in between and, where there is a limit,
+on the controls. Each pass linearises the held Runge-Kutta dynamics, solves one sparse quadratic
+program, and accepts the step if it lowers an exact penalty of the true problem. The defects are
+those of the true dynamics at every pass; the slopes come from a coarser Runge-Kutta step, which
+moves the limit by far less than the tolerance on effort and halves the cost of a pass.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -100,12 +101,20 @@ class ScpSolver:
         system: The system.
         period: Control period [s].
         settings: How to iterate.
+        control_limit: Largest magnitude of each control.
     """
 
-    def __init__(self, system: System, period: float, settings: ScpSettings | None = None) -> None:
+    def __init__(
+        self,
+        system: System,
+        period: float,
+        settings: ScpSettings | None = None,
+        control_limit: float = math.inf,
+    ) -> None:
         """Remember the problem's constants."""
         self.system = system
         self.period = period
+        self.control_limit = min(control_limit, UNBOUNDED)
         self.settings = settings or ScpSettings()
         # The sparsity of each horizon met so far.
         self._layouts: dict[int, _Layout] = {}
@@ -242,6 +251,7 @@ class ScpSolver:
         low = np.full(reference.size, -UNBOUNDED)
         high = np.full(reference.size, UNBOUNDED)
         low[layout.states[:-1]], high[layout.states[:-1]] = bounds
+        low[layout.controls], high[layout.controls] = -self.control_limit, self.control_limit
         low[layout.states[-1]] = high[layout.states[-1]] = states[-1]
         return QuadraticProgram(diagonal, -weight * reference, equality, offset.ravel(), low, high)
 

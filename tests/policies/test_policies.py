@@ -42,6 +42,7 @@ def build(env, metric, weights_file):
             settings.setdefault("metric", metric)
         elif name in ("lagros", "learned"):
             settings.setdefault("weights", weights_file)
+            settings.setdefault("allow_other_settings", True)
         return make(name, env, **settings)
 
     return build
@@ -165,7 +166,7 @@ def test_force_does_not_depend_on_the_unit_of_the_action(metric, weights_file, o
             policy = TubeMpcPolicy(settings, metric)
         else:
             cls = LagrosPolicy if name == "lagros" else LearnedPolicy
-            policy = cls(settings, weights_file)
+            policy = cls(settings, weights_file, allow_other_settings=True)
         forces.append(scale * policy.predict(observations)[0])
     assert forces[0] == pytest.approx(forces[1], rel=1e-5)
 

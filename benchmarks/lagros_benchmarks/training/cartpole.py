@@ -5,6 +5,7 @@ An agent controls the cart-pole alone, or corrects LAG-ROS by a force of at most
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from lagros_policies.actor import Actor, ActorPolicy, goal_frame
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.policy import Policy
 from lagros_policies.residual import ResidualPolicy
+from lagros_policies.trained_for import cartpole_range, weights_record
 
 # What is large on this task, for the features of an agent without running normalisation: the
 # farthest goal [m], a start [rad], and the rates of a cart that hurries there [m/s, rad/s].
@@ -92,6 +94,7 @@ class CartPoleLesson:
         """Build the worlds; see the class."""
         self.training = training
         settings = task.CartPoleSettings(effort_weight=training.effort_weight)
+        self.settings = settings
         self.force_scale = settings.force_scale
         worlds = CartPoleVectorEnv(
             training.worlds,
@@ -153,7 +156,10 @@ class CartPoleLesson:
 
     def save(self, model: BaseAlgorithm, path: Path) -> None:
         """Write the actor as safetensors."""
-        extract_actor(model, self.force_scale).save(path)
+        plain = self.training.largest_correction is None
+        name = self.training.algorithm.name if plain else "residual"
+        metadata = weights_record("cartpole", name, cartpole_range(self.settings, timed=False))
+        replace(extract_actor(model, self.force_scale), metadata=metadata).save(path)
 
 
 def extract_actor(model: BaseAlgorithm, force_scale: float = 40.0) -> Actor:

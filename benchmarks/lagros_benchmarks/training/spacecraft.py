@@ -37,6 +37,7 @@ from lagros_policies.spacecraft_ppo import (
     look,
     thrust_of,
 )
+from lagros_policies.trained_for import spacecraft_range, weights_record
 
 FloatArray = NDArray[np.float64]
 RATES = ("success", "strict_success", "paper_success", "collided")
@@ -228,7 +229,12 @@ class SpacecraftLesson:
 
     def save(self, model: BaseAlgorithm, path: Path) -> None:
         """Write the actor as safetensors."""
-        actor_network(model).save(path)
+        network = actor_network(model)
+        # It trains in shorter episodes, and is judged in those of the task.
+        trained_for = spacecraft_range(SpacecraftSettings(), [self.training.preset])
+        name = self.training.algorithm.name
+        network.metadata.update(weights_record("spacecraft", name, trained_for))
+        network.save(path)
 
     def _fly(
         self, model: BaseAlgorithm, preset: str, agents: int, seeds: Sequence[int], bound: float

@@ -1,0 +1,161 @@
+"""What a network or a metric was made for, and whether it may fly another task.
+
+The metadata of a file name the task, the policy and the settings that the training was about. A
+file without them is taken for one of the paper's task, for which all commands of this package
+train.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from typing import Any, Literal
+
+from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.dynamics import CartPole
+from lagros_envs.scenarios import Preset, preset_named
+from lagros_envs.spacecraft_task import SpacecraftSettings
+
+TASK, POLICY, SETTINGS = KEYS = ("task", "policy", "trained_for")
+Rule = Literal["equal", "at_most", "one_of"]
+# By rule and by name, what the settings of a flight are held against.
+Range = Mapping[str, Mapping[str, Any]]
+
+# Presets whose bodies the shipped networks of the spacecraft met in training or in what is
+# published about them.
+PUBLISHED = ("paper", "released")
+
+
+def cartpole_range(task: CartPoleSettings, timed: bool) -> Range:
+    """Return what a network of the cart-pole that was trained for a task may fly.
+
+    Args:
+        task: The task.
+        timed: Whether the network counts on the time at which the episode ends.
+    """
+    equal: dict[str, Any] = _body(task.system)
+    equal |= {name: getattr(task, name) for name in ("control_period", "force_limit")}
+    at_most = {name: getattr(task, name) for name in ("initial_angle", "goal_range")}
+    (equal if timed else at_most)["time_limit"] = task.time_limit
+    return {"equal": equal, "at_most": at_most}
+
+
+def cartpole_design(system: CartPole) -> Range:
+    """Return what a metric that was designed for a cart-pole may track."""
+    return {"equal": _body(system)}
+
+
+def spacecraft_range(task: SpacecraftSettings, presets: Iterable[str | Preset]) -> Range:
+    """Return what a network of the spacecraft that was trained for a task may fly.
+
+    It looks at what one agent senses, so that it is not tied to a number of agents or obstacles.
+
+    Args:
+        task: The task.
+        presets: Those whose bodies it has met.
+    """
+    names = ("control_period", "horizon", "sensing_radius", "thrust_limit")
+    return {
+        "equal": _body(task.system) | {name: getattr(task, name) for name in names},
+        "at_most": {"time_limit": task.time_limit},
+        "one_of": {"radii": [_radii(preset_named(preset)) for preset in presets]},
+    }
+
+
+def weights_record(task: str, policy: str, trained_for: Range) -> dict[str, str]:
+    """Return the metadata of a weights file.
+
+    Args:
+        task: "cartpole" or "spacecraft".
+        policy: Name of the policy that flies it.
+        trained_for: What it may fly.
+    """
+    return {TASK: task, POLICY: policy, SETTINGS: json.dumps(trained_for, sort_keys=True)}
+
+
+def check_trained_for(
+    metadata: Mapping[str, str],
+    what: str,
+    policy: str | None,
+    flown: CartPoleSettings | tuple[SpacecraftSettings, Preset],
+    assumed: Range,
+    allow_other_settings: bool = False,
+) -> None:
+    """Check that a network flies as what it was trained, and within what it was trained for.
+
+    Args:
+        metadata: Of its weights.
+        what: The weights, for the message.
+        policy: Name of the policy that is to fly it; None for any.
+        flown: The task, with the preset of the spacecraft.
+        assumed: What it may fly if the metadata do not say.
+        allow_other_settings: Do not look at the settings.
+
+    Raises:
+        ValueError: It is another policy's, or the settings are others.
+    """
+    task = "cartpole" if isinstance(flown, CartPoleSettings) else "spacecraft"
+    found = metadata.get(TASK, task), metadata.get(POLICY, policy)
+    if found[0] != task or (policy is not None and found[1] != policy):
+        raise ValueError(
+            f"{what} holds the policy {found[1]!r} of the {found[0]}, not {policy!r} of the {task}"
+        )
+    if allow_other_settings:
+        return
+    for name, value in _flown(flown).items():
+        needed = _needed(_range_of(metadata, what, assumed), name, value)
+        if needed is not None:
+            raise ValueError(
+                f"{name}={value!r}: {what} was made for {needed}; use what was made for this task, "
+                "or pass allow_other_settings=True to fly outside of that"
+            )
+
+
+def _range_of(metadata: Mapping[str, str], what: str, assumed: Range) -> Range:
+    text = metadata.get(SETTINGS)
+    if text is None:
+        return assumed
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{what}: its {SETTINGS!r} is not JSON ({error})") from error
+    if not isinstance(value, dict) or not all(isinstance(part, dict) for part in value.values()):
+        raise ValueError(f"{what}: its {SETTINGS!r} must be rules, names and values")
+    return value
+
+
+def _needed(trained_for: Range, name: str, value: Any) -> str | None:
+    """Return what a setting must be, in words; None if it is, or nothing is said about it."""
+    for rule, words in (("equal", ""), ("at_most", "at most "), ("one_of", "one of ")):
+        limits = trained_for.get(rule, {})
+        if name not in limits:
+            continue
+        limit = limits[name]
+        if rule == "equal":
+            holds = value == limit
+        elif rule == "at_most":
+            holds = isinstance(limit, int | float) and value <= limit
+        else:
+            holds = isinstance(limit, list) and value in limit
+        return None if holds else f"{words}{limit!r}"
+    return None
+
+
+def _flown(flown: CartPoleSettings | tuple[SpacecraftSettings, Preset]) -> dict[str, Any]:
+    """Return all that a range may speak about."""
+    task, preset = (flown, None) if isinstance(flown, CartPoleSettings) else flown
+    values = {item.name: getattr(task, item.name) for item in fields(task)}
+    values |= _body(task.system)
+    if preset is not None:
+        values["radii"] = _radii(preset)
+    return values
+
+
+def _body(system: Any) -> dict[str, float]:
+    return {f"system.{item.name}": getattr(system, item.name) for item in fields(system)}
+
+
+def _radii(preset: Preset) -> list[float]:
+    """Return the radii of an agent against others and against obstacles, and of an obstacle."""
+    return [preset.agent_radius, preset.core, preset.obstacle_radius]
