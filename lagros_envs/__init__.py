@@ -12,10 +12,12 @@ register(
     id="lagros/CartPole-v0",
     entry_point="lagros_envs.cartpole:CartPoleEnv",
     vector_entry_point="lagros_envs.cartpole_vector:CartPoleVectorEnv",
+    max_episode_steps=90,  # of the default settings, as below; the environment itself truncates
 )
 
 register(
     id="lagros/Spacecraft-v0",
     entry_point="lagros_envs.spacecraft_single:SpacecraftEnv",
     vector_entry_point="lagros_envs.spacecraft_vector:SpacecraftVectorEnv",
+    max_episode_steps=450,
 )

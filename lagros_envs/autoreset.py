@@ -13,7 +13,16 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from lagros_envs.conventions import (
+    Conforming,
+    End,
+    LimitedSettings,
+    check_step_limit,
+    plain_seed,
+    warned_after,
+)
 from lagros_envs.disturbances import Disturbance
+from lagros_envs.options import known_options
 
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
@@ -60,7 +69,7 @@ def nominal_after(
     return np.where(starting.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
-class RestartingVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, Any]):
+class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32Array, Any]):
     """Worlds side by side, each of which starts a new episode when its own has ended.
 
     A world has one row or more in what is observed and done. A subclass moves the worlds and says
@@ -69,7 +78,7 @@ class RestartingVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, Any])
     `reset(seed=...)` takes one integer, from which the worlds draw independent seeds, or a list
     with one seed per world, each of which starts the episode that the single environment starts.
     `reset(options=...)` takes `reset_mask` (worlds,), the worlds to start; what the options say of
-    the others is not looked at.
+    the others is not looked at. A reset that is refused leaves every world as it was.
 
     Args:
         num_envs: Number of rows.
@@ -77,15 +86,21 @@ class RestartingVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, Any])
         single_observation_space: Of one row.
         single_action_space: Of one row.
         disturbance: The disturbance.
+        settings: The task.
+        max_episode_steps: Control steps after which an episode is truncated, at most those of the
+            task; None for those. `gym.make_vec` passes the number that the id is registered with.
         autoreset_mode: "next_step" (Gymnasium's default), "same_step" (the last observation and
             info of an episode come in `info["final_obs"]` and `info["final_info"]`) or "disabled".
         render_mode: Must be None.
         drawn_by: What a user who wants to see a world makes instead.
 
     Raises:
-        ValueError: The mode is unknown, or a render mode was asked for.
+        ValueError: The mode is unknown, the limit contradicts the task, or a render mode was asked
+            for.
     """
 
+    # What `reset(options=...)` may hold.
+    option_names: tuple[str, ...] = ("reset_mask",)
     metadata = {
         "render_modes": [],
         "autoreset_mode": AutoresetMode.NEXT_STEP,
@@ -98,6 +113,8 @@ class RestartingVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, Any])
         single_observation_space: spaces.Space[Any],
         single_action_space: spaces.Space[Any],
         disturbance: Disturbance,
+        settings: LimitedSettings,
+        max_episode_steps: int | None,
         autoreset_mode: str | AutoresetMode,
         render_mode: str | None,
         drawn_by: str,
@@ -107,6 +124,8 @@ class RestartingVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, Any])
             raise ValueError(
                 f"render_mode={render_mode!r}: the vector environment does not draw; use {drawn_by}"
             )
+        check_step_limit(max_episode_steps, settings)
+        self.step_limit = min(settings.steps, max_episode_steps or settings.steps)
         self.num_envs, self.num_worlds = num_envs, num_worlds
         self.single_observation_space = single_observation_space
         self.single_action_space = single_action_space
@@ -119,14 +138,20 @@ class RestartingVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, Any])
         # Worlds whose episode ended and that start anew on the next call of step.
         self._pending = np.zeros(num_worlds, bool)
         self._started = False
+        # Of the episodes of all worlds, where nothing starts them anew.
+        self._end = End.NOT_YET
 
     @abstractmethod
-    def _start(self, worlds: IntArray, seeds: Sequence[int], options: dict[str, Any]) -> None:
-        """Begin an episode in these worlds, one seed for each."""
+    def _start(self, worlds: IntArray, seeds: Sequence[int], given: dict[str, Any]) -> None:
+        """Begin an episode in these worlds, one seed for each, with what `_checked` returned."""
 
     @abstractmethod
-    def _set_nominal(self, mask: BoolArray, options: dict[str, Any]) -> None:
-        """Take the nominal trajectories of the masked worlds from the options of a reset."""
+    def _checked(self, mask: BoolArray, options: dict[str, Any]) -> dict[str, Any]:
+        """Check the options of a reset for the masked worlds, and return what to start from."""
+
+    @abstractmethod
+    def _set_nominal(self, mask: BoolArray, given: dict[str, Any]) -> None:
+        """Take the nominal trajectories of the masked worlds from what `_checked` returned."""
 
     @abstractmethod
     def _forget_nominal(self, mask: BoolArray) -> None:
@@ -156,30 +181,34 @@ class RestartingVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, Any])
             Observations, one per row, and the info, whose entries have a leading axis of rows.
 
         Raises:
-            ValueError: A seed list or an option has a wrong length, shape or value.
+            ValueError: A seed is none, or an option is unknown, or one of the two has a wrong
+                length, shape or value.
         """
-        options = options or {}
+        options = known_options(options, self.option_names)
         seeds = self._seeds(seed)
-        if seeds is not None:
-            # The episodes that autoreset starts are as reproducible as the first ones.
-            self.np_random = np.random.default_rng(seeds)
-        elif seed is not None:
-            super().reset(seed=int(cast(int, seed)))
-        mask = np.asarray(options.get("reset_mask", np.ones(self.num_worlds, bool)))
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_worlds, bool)))
         if mask.shape != (self.num_worlds,) or mask.dtype != np.bool_:
             raise ValueError(
                 f"options['reset_mask'] must be {self.num_worlds} booleans, one per world"
             )
         if not self._started and not mask.all():
             raise ValueError("the first reset must start every world; leave out reset_mask")
-        self._set_nominal(mask, options)
-        self._begin(mask, seeds, options)
-        self._started = True
+        given = self._checked(mask, options)
+        if seeds is not None:
+            # The episodes that autoreset starts are as reproducible as the first ones.
+            self.np_random = np.random.default_rng(seeds)
+        elif seed is not None:
+            super().reset(seed=plain_seed(cast(int, seed)))
+        self._begin(mask, seeds, given)
+        self._set_nominal(mask, given)
+        self._started, self._end = True, End.NOT_YET
         return self._observation(), self._info()
 
     def _need_start(self) -> None:
         if not self._started:
             raise RuntimeError("call reset() before step()")
+        if self._end is not End.NOT_YET:
+            self._end = warned_after(self._end)
 
     def _restart_pending(self) -> BoolArray | None:
         """Start what the last step has left to be started; return which worlds that are, if any."""
@@ -197,6 +226,8 @@ class RestartingVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, Any])
         """
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             self._pending = ended
+        elif self.autoreset_mode is AutoresetMode.DISABLED:
+            self._note_end(ended)
         elif self.autoreset_mode is AutoresetMode.SAME_STEP and np.count_nonzero(ended):
             final_observation, final_info = self._observation(), self._info()
             self._begin_unasked(ended)
@@ -207,8 +238,15 @@ class RestartingVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, Any])
             return self._observation(), info
         return self._observation(), self._info()
 
+    def _note_end(self, ended: BoolArray) -> None:
+        # Where some worlds go on the others are stepped along with them; nobody has to look at
+        # what becomes of those. Where none goes on, a further step is a mistake.
+        if self._end is End.NOT_YET and np.count_nonzero(ended) == ended.size:
+            self._end = End.REACHED
+
     def _seeds(self, seed: int | Sequence[int] | None) -> list[int] | None:
         if seed is None or isinstance(seed, int | np.integer):
+            plain_seed(seed)
             return None
         seeds = [int(value) for value in seed]
         if len(seeds) != self.num_worlds or min(seeds) < 0:
@@ -229,7 +267,7 @@ class RestartingVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, Any])
         self._forget_nominal(mask)
         self._begin(mask, None, {})
 
-    def _begin(self, mask: BoolArray, seeds: list[int] | None, options: dict[str, Any]) -> None:
+    def _begin(self, mask: BoolArray, seeds: list[int] | None, given: dict[str, Any]) -> None:
         """Start the masked worlds, from the seeds of all or from new ones."""
         worlds = np.flatnonzero(mask)
         chosen = (
@@ -237,5 +275,5 @@ class RestartingVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, Any])
             if seeds is None
             else [seeds[world] for world in worlds]
         )
-        self._start(worlds, chosen, options)
+        self._start(worlds, chosen, given)
         self._pending = self._pending & ~mask

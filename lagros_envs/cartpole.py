@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal, cast
 
 import gymnasium as gym
@@ -12,19 +13,30 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
+from lagros_envs.conventions import (
+    RENDER_MODES,
+    Conforming,
+    End,
+    check_render_mode,
+    plain_seed,
+    settings_of,
+    warned_after,
+)
 from lagros_envs.disturbances import Disturbance, Situation, channel_mask
 from lagros_envs.dynamics.held import HeldStep
+from lagros_envs.options import checked_actions, known_options
 from lagros_envs.seeding import episode_streams
 
 FloatArray = NDArray[np.float64]
 
 
-class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """Cart-pole with a continuous force, held for 0.1 s, and a bounded disturbance of the state.
 
     ## Action
     One number, `Box(-1, 1, (1,))`: the force on the cart in units of `settings.force_scale`
-    (40 N). Actions beyond +-1 are applied as they are, unless `settings.force_limit` is set.
+    (40 N). Actions beyond +-1 are applied as they are, unless `settings.force_limit` is set, up to
+    `cartpole_task.LARGEST_FORCE`.
 
     ## Observation
     A flat float32 vector of 13; `gymnasium.spaces.unflatten(env.unwrapped.named_space, obs)` names
@@ -47,19 +59,23 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     ## Starting state
     theta_0 uniform in +-60 degrees at rest, goal p_f uniform in +-5 m. `reset(options=...)` takes
-    `initial_state`, `goal` and `nominal` (x_d at every control instant, shape (91, 4)).
+    `initial_state`, `goal` and `nominal` (x_d at every control instant, shape (91, 4)). A reset
+    that is refused leaves the environment as it was.
 
     ## Episode end
     `terminated` when |theta| > pi/2 (a fall; so is a force too large to integrate, which leaves the
     state as it was); `truncated` at 9 s. The episode goes on after success: the paper counts the
-    first entry, the strict measure looks at the end.
+    first entry, the strict measure looks at the end. `gym.make(..., max_episode_steps=20)` ends
+    episodes sooner; longer ones need a longer `settings.time_limit` and a `max_episode_steps` to
+    match.
 
     ## Info
-    `success` (the paper's: at some control instant so far ||x - x_f|| <= r(t)), `success_time` [s]
-    (inf before), `inside_tube` (the same at this instant), `fallen`, `effort` (the integral of
-    ||u||^2 so far), `effort_to_success` (the same, frozen at the first success), `disturbance` (d
-    of the step), `tube_radius` r(t), `goal_distance` and, where the episode has a nominal,
-    `tracking_error` ||x - x_d||.
+    `success` (the paper's: at some control instant so far ||x - x_f|| <= r(t)), `is_success` (the
+    same, by the name that other libraries read), `success_time` [s] (inf before), `inside_tube`
+    (||x - x_f|| <= r(t) at this instant), `fallen`, `effort` (the integral of ||u||^2 so far),
+    `effort_to_success` (the same, frozen at the first success), `disturbance` (d of the step),
+    `tube_radius` r(t), `goal_distance` and, where the episode has a nominal, `tracking_error`
+    ||x - x_d||.
 
     Args:
         disturbance: Kind of disturbance, one of `lagros_envs.disturbances.KINDS`, or a function of
@@ -67,7 +83,8 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         disturbance_bound: d_bar, in units of the state per second.
         disturbance_channels: "all", "rates", or a mask of the four states.
         metric: Contraction metric M for the kind "worst": (4, 4), or a function of the state.
-        settings: The task.
+        settings: The task: a `CartPoleSettings`, or a dictionary of those fields that differ from
+            the defaults.
         compiled: Whether numba (the extra "fast") compiles the equation of motion; the trajectories
             stay the same, bit for bit.
         render_mode: None, "human" or "rgb_array".
@@ -77,7 +94,8 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         ImportError: `compiled` was asked for and numba is not installed.
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
+    settings: task.CartPoleSettings
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}
 
     def __init__(
         self,
@@ -85,17 +103,13 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         disturbance_bound: float = 0.75,
         disturbance_channels: Literal["all", "rates"] | Sequence[bool] = "all",
         metric: Any = None,
-        settings: task.CartPoleSettings | None = None,
+        settings: task.CartPoleSettings | Mapping[str, Any] | None = None,
         compiled: bool = False,
         render_mode: str | None = None,
     ) -> None:
         """Build the environment; see the class for the arguments."""
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(
-                f"render_mode={render_mode!r} is not known; use one of "
-                f"{self.metadata['render_modes']} or None"
-            )
-        self.settings = settings or task.CartPoleSettings()
+        self.render_mode = check_render_mode(render_mode)
+        self.settings = settings_of(task.CartPoleSettings(), settings)
         self._hold = HeldStep(
             self.settings.system,
             self.settings.control_period,
@@ -115,9 +129,9 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             "spaces.Space[NDArray[np.float32]]", spaces.flatten_space(self.named_space)
         )
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
-        self.render_mode = render_mode
         self._renderer: Any = None
         self._started = False
+        self._end = End.NOT_YET
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -132,24 +146,27 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             The observation and the info.
 
         Raises:
-            ValueError: An option has a wrong shape or value.
+            ValueError: The seed is none, or an option is unknown or has a wrong shape or value.
         """
-        super().reset(seed=seed)
-        options = options or {}
-        if seed is None:
-            seed = int(self.np_random.integers(2**63))
-        streams = episode_streams(seed)
-        drawn = task.sample_scenario(streams.scenario, self.settings)
-        self.scenario = task.scenario_from_options(options, drawn)
-        self.nominal = task.nominal_from_options(options, self.settings)
-        self._pushes = self.disturbance.realise(
-            streams.disturbance, self._steps, self.settings.control_period
-        )
-        if self.disturbance.kind == "worst" and self.nominal is None:
+        options = known_options(options, task.OPTIONS)
+        given = task.start_and_goal(options, (task.STATE_DIM,))
+        nominal = task.nominal_from_options(options, self.settings)
+        if self.disturbance.kind == "worst" and nominal is None:
             raise ValueError(
                 'disturbance="worst" needs the nominal trajectory of the episode: pass '
                 'reset(options={"nominal": array of shape (steps + 1, 4)})'
             )
+        seed = plain_seed(seed)
+        super().reset(seed=seed)
+        if seed is None:
+            seed = int(self.np_random.integers(2**63))
+        streams = episode_streams(seed)
+        drawn = task.sample_scenario(streams.scenario, self.settings)
+        self.scenario = replace(drawn, **given)
+        self.nominal = nominal
+        self._pushes = self.disturbance.realise(
+            streams.disturbance, self._steps, self.settings.control_period
+        )
         self._state: tuple[float, ...] = tuple(self.scenario.initial_state.tolist())
         self._goal: tuple[float, ...] = tuple(self.scenario.goal.tolist())
         # What stays the same in every observation of the episode.
@@ -162,6 +179,7 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._success_time = math.inf
         self._push = np.zeros(task.STATE_DIM)
         self._started = True
+        self._end = End.NOT_YET
         arrival = self._note_arrival(self._goal_distance(), fallen=False)
         if self.render_mode == "human":
             self.render()
@@ -185,6 +203,8 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if not self._started:
             raise RuntimeError("call reset() before step()")
         force = self._force(action)
+        if self._end is not End.NOT_YET:
+            self._end = warned_after(self._end)
         self._push = self._current_push()
         integrated, distance, effort, reward = self._advance(force)
         self._step += 1
@@ -197,6 +217,8 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self.render_mode == "human":
             self.render()
         truncated = self._step >= self._steps
+        if (fallen or truncated) and self._end is End.NOT_YET:
+            self._end = End.REACHED
         return self._observation(), reward, fallen, truncated, self._info(arrival, fallen)
 
     @property
@@ -241,12 +263,13 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._renderer = None
 
     def _force(self, action: NDArray[np.float32]) -> float:
-        values = np.asarray(action)
-        if values.shape != (1,):
-            raise ValueError(f"action has shape {values.shape}; it must be one number, shape (1,)")
-        value = values.item()
+        if type(action) is np.ndarray and action.shape == (1,) and action.dtype.kind == "f":
+            value = action.item()
+        else:
+            value = math.nan
         if not math.isfinite(value):
-            raise ValueError(f"action={value!r} is not finite")
+            # Slower, and with a message.
+            value = checked_actions(action, (1,), "the force").item()
         force: float = task.applied_force(self.settings, value, _clip)
         return force
 
@@ -318,8 +341,10 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def _info(self, arrival: tuple[float, float, bool, bool], fallen: bool) -> dict[str, Any]:
         distance, radius, inside, _ = arrival
+        success = self._success_time != math.inf
         info = {
-            "success": self._success_time != math.inf,
+            "success": success,
+            "is_success": success,
             "success_time": self._success_time,
             "inside_tube": inside,
             "fallen": fallen,
@@ -336,4 +361,5 @@ class CartPoleEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def _clip(value: float, low: float, high: float) -> float:
-    return min(max(value, low), high)
+    # Comparisons: calling min and max takes three times as long.
+    return value if low <= value <= high else high if value > high else low

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import check_fields, check_multiple, check_not_negative, check_positive
 from lagros_envs.dynamics import CartPole
-from lagros_envs.options import nominal_option
+from lagros_envs.options import nominal_option, option_numbers
 from lagros_envs.tube import PaperTube
 
 FloatArray = NDArray[np.float64]
@@ -27,6 +27,11 @@ RATES = (False, False, True, True)
 FALL_ANGLE = math.pi / 2  # [rad]
 # Farther from its goal than this the integration has diverged under an enormous force.
 LARGEST_DISTANCE = 1e12
+# No force is larger [N], whatever the action: nothing stands under it, and the effort of an episode
+# stays a number, in single precision as well.
+LARGEST_FORCE = 1e16
+# What `reset(options=...)` may hold.
+OPTIONS = ("initial_state", "goal", "nominal")
 # Where each named part of the observation lies.
 STATE = slice(0, 4)
 GOAL = slice(4, 8)
@@ -124,45 +129,41 @@ def scenario_of_shares(shares: FloatArray, settings: CartPoleSettings) -> CartPo
     return CartPoleScenario(initial_state, goal)
 
 
-def scenario_from_options(options: dict[str, Any], drawn: CartPoleScenario) -> CartPoleScenario:
-    """Replace the drawn scenario by what `reset(options=...)` states.
+def start_and_goal(
+    options: dict[str, Any],
+    shape: tuple[int, ...],
+    looked_at: NDArray[np.bool_] | None = None,
+) -> dict[str, FloatArray]:
+    """Return `initial_state` and `goal`, each of this shape (..., 4), where the options hold them.
 
     Args:
-        options: May hold `initial_state` (..., 4) and `goal` ((..., 4), or p_f alone, (...)).
-        drawn: What to keep where the options are silent.
-
-    Returns:
-        The scenario of the episode, or of each of several.
+        options: As given to reset.
+        shape: Leading axes, then 4; a goal may also be p_f alone.
+        looked_at: Which of a leading axis are read; all of them if left out.
 
     Raises:
-        ValueError: A value has the wrong shape, is not finite, or starts fallen.
+        ValueError: A value has the wrong shape, is not finite or too large, or starts fallen.
     """
-    initial_state, goal = drawn.initial_state, drawn.goal
-    shape = goal.shape
+    given: dict[str, FloatArray] = {}
     if "initial_state" in options:
-        initial_state = _finite("initial_state", options["initial_state"], shape)
-        angles = np.abs(initial_state[..., 1])
+        value = options["initial_state"]
+        given["initial_state"] = start = option_numbers(
+            "initial_state", value, shape, looked_at=looked_at
+        )
+        angles = np.abs((start if looked_at is None else start[looked_at])[..., 1])
         if np.any(angles > FALL_ANGLE):
             raise ValueError(
                 f"options['initial_state'] has an angle of {np.max(angles):.3f} rad; "
                 "beyond pi/2 the pole has already fallen"
             )
     if "goal" in options:
-        if np.shape(options["goal"]) == shape[:-1]:
+        goal = option_numbers("goal", options["goal"], shape, shape[:-1], looked_at=looked_at)
+        if goal.shape != shape:
+            position = goal
             goal = np.zeros(shape)
-            goal[..., 0] = _finite("goal", options["goal"], shape[:-1])
-        else:
-            goal = _finite("goal", options["goal"], shape, shape[:-1])
-    return CartPoleScenario(initial_state, goal)
-
-
-def _finite(name: str, value: Any, *shapes: tuple[int, ...]) -> FloatArray:
-    """Return a copy of the option in double precision; the first shape is the one it must have."""
-    array = np.array(value, dtype=np.float64)
-    if array.shape != shapes[0] or not np.all(np.isfinite(array)):
-        wanted = " or ".join(map(str, shapes))
-        raise ValueError(f"options[{name!r}]={value!r} must be finite numbers of shape {wanted}")
-    return array
+            goal[..., 0] = position
+        given["goal"] = goal
+    return given
 
 
 def nominal_from_options(
@@ -192,14 +193,11 @@ def named_space(settings: CartPoleSettings) -> spaces.Dict:
     The parts are `state` x, `goal` x_f and `initial_state` x(0), each (4,) in [m, rad, m/s, rad/s],
     and `time` t, (1,) in [s].
     """
-    # Rates are not bounded by the task; the largest float32 says so without an infinity, which
-    # Gymnasium's checker takes for a mistake.
-    widest = float(np.finfo(np.float32).max)
 
     def box(low: list[float], high: list[float]) -> spaces.Box:
         return spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
 
-    unbounded = ([-widest] * STATE_DIM, [widest] * STATE_DIM)
+    unbounded = ([-math.inf] * STATE_DIM, [math.inf] * STATE_DIM)
     return spaces.Dict(
         OrderedDict(
             state=box(*unbounded),
@@ -212,9 +210,8 @@ def named_space(settings: CartPoleSettings) -> spaces.Dict:
 
 def applied_force(settings: CartPoleSettings, action: Any, clip: Any) -> Any:
     """Return the force of an action [N] (floats or arrays): scaled, then clipped to the limit."""
-    force = settings.force_scale * action
-    limit = settings.force_limit
-    return force if limit is None else clip(force, -limit, limit)
+    limit = LARGEST_FORCE if settings.force_limit is None else settings.force_limit
+    return clip(settings.force_scale * action, -limit, limit)
 
 
 def goal_distance(state: Any, goal: Any, sqrt: Any) -> Any:

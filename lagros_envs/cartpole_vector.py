@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,8 +14,10 @@ from numpy.typing import NDArray
 from lagros_envs import cartpole_task as task
 from lagros_envs.autoreset import RestartingVectorEnv, nominal_after
 from lagros_envs.checks import check_whole
+from lagros_envs.conventions import settings_of
 from lagros_envs.disturbances import Disturbance, Situation, channel_mask
 from lagros_envs.dynamics.held import HeldBatch
+from lagros_envs.options import checked_actions
 from lagros_envs.seeding import seeded_streams
 
 FloatArray = NDArray[np.float64]
@@ -40,6 +43,7 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         compiled: Whether numba (the extra "fast") compiles the equation of motion, which makes a
             step eight times faster; None: where it is installed. Compiled states differ from those
             of NumPy in the last digits (1e-15 a step).
+        max_episode_steps: As in `autoreset.RestartingVectorEnv`.
         autoreset_mode: As in `autoreset.RestartingVectorEnv`.
         render_mode: Must be None; render a single environment instead.
 
@@ -51,6 +55,9 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         ImportError: `compiled=True` and numba is not installed.
     """
 
+    settings: task.CartPoleSettings
+    option_names = ("reset_mask", *task.OPTIONS)
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -58,14 +65,15 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         disturbance_bound: float = 0.75,
         disturbance_channels: Literal["all", "rates"] | Sequence[bool] = "all",
         metric: Any = None,
-        settings: task.CartPoleSettings | None = None,
+        settings: task.CartPoleSettings | Mapping[str, Any] | None = None,
         compiled: bool | None = None,
         autoreset_mode: Literal["next_step", "same_step", "disabled"] | AutoresetMode = "next_step",
         render_mode: str | None = None,
+        max_episode_steps: int | None = None,
     ) -> None:
         """Build the worlds; see the class for the arguments."""
         check_whole("num_envs", num_envs)
-        self.settings = settings or task.CartPoleSettings()
+        self.settings = settings_of(task.CartPoleSettings(), settings)
         self.named_space = task.named_space(self.settings)
         super().__init__(
             num_envs,
@@ -78,6 +86,8 @@ class CartPoleVectorEnv(RestartingVectorEnv):
                 channel_mask(disturbance_channels, task.RATES),
                 metric,
             ),
+            self.settings,
+            max_episode_steps,
             autoreset_mode,
             render_mode,
             'gym.make("lagros/CartPole-v0", render_mode=...)',
@@ -153,7 +163,7 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         if restarting is not None:
             rewards[restarting] = 0.0
         terminated = self._fallen.copy()
-        truncated = self._step >= self._steps
+        truncated = self._step >= self.step_limit
         observation, info = self._after_step(terminated | truncated)
         return observation, rewards, terminated, truncated, info
 
@@ -162,26 +172,30 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         """The states x in double precision, shape (num_envs, 4)."""
         return np.ascontiguousarray(self._state.T)
 
-    def _set_nominal(self, mask: BoolArray, options: dict[str, Any]) -> None:
-        given = task.nominal_from_options(options, self.settings, (self.num_envs,), mask)
-        if self.disturbance.kind == "worst" and given is None:
+    def _checked(self, mask: BoolArray, options: dict[str, Any]) -> dict[str, Any]:
+        nominal = task.nominal_from_options(options, self.settings, (self.num_envs,), mask)
+        if self.disturbance.kind == "worst" and nominal is None:
             raise ValueError(
                 'disturbance="worst" needs the nominal trajectories: pass '
                 'reset(options={"nominal": array of shape (num_envs, steps + 1, 4)})'
             )
-        self.nominal = nominal_after(None if mask.all() else self.nominal, mask, given)
+        scenario = task.start_and_goal(options, (self.num_envs, task.STATE_DIM), mask)
+        return {"nominal": nominal, "scenario": scenario}
+
+    def _set_nominal(self, mask: BoolArray, given: dict[str, Any]) -> None:
+        kept = None if mask.all() else self.nominal
+        self.nominal = nominal_after(kept, mask, given["nominal"])
 
     def _forget_nominal(self, mask: BoolArray) -> None:
         self.nominal = nominal_after(self.nominal, mask, None)
 
-    def _start(self, worlds: IntArray, seeds: Sequence[int], options: dict[str, Any]) -> None:
+    def _start(self, worlds: IntArray, seeds: Sequence[int], given: dict[str, Any]) -> None:
         settings = self.settings
         shares = np.empty((worlds.size, 2))
         for row, rng in zip(shares, seeded_streams(seeds, "scenario"), strict=True):
             row[:] = task.draw_shares(rng)
-        scenario = task.scenario_from_options(
-            self._of_worlds(options, worlds), task.scenario_of_shares(shares, settings)
-        )
+        stated = {name: value[worlds] for name, value in given.get("scenario", {}).items()}
+        scenario = replace(task.scenario_of_shares(shares, settings), **stated)
         pushes = np.empty((worlds.size, self._steps, task.STATE_DIM))
         streams = seeded_streams(seeds, "disturbance")
         self.disturbance.realise_all(streams, pushes, settings.control_period)
@@ -203,22 +217,6 @@ class CartPoleVectorEnv(RestartingVectorEnv):
     def _measure_distance(self, worlds: IntArray | BoolArray) -> None:
         pair = self._state[:, worlds], self._goal[:, worlds]
         self._distance[worlds] = task.goal_distance(*pair, np.sqrt)
-
-    def _of_worlds(self, options: dict[str, Any], worlds: IntArray) -> dict[str, Any]:
-        """Return start and goal of the options, for these worlds only."""
-        worlds_and_state = (self.num_envs, task.STATE_DIM)
-        shapes: dict[str, list[tuple[int, ...]]] = {
-            "initial_state": [worlds_and_state],
-            "goal": [worlds_and_state, (self.num_envs,)],
-        }
-        chosen = {}
-        for name in shapes.keys() & options.keys():
-            value = np.asarray(options[name], np.float64)
-            if value.shape not in shapes[name]:
-                wanted = " or ".join(map(str, shapes[name]))
-                raise ValueError(f"options[{name!r}] has shape {value.shape}; it must be {wanted}")
-            chosen[name] = value[worlds]
-        return chosen
 
     def _advance(
         self, force: FloatArray, restarting: BoolArray | None
@@ -264,18 +262,9 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         return self.disturbance.respond(situation).copy()
 
     def _force(self, actions: NDArray[np.float32]) -> FloatArray:
-        values = np.asarray(actions)
-        if values.shape != (self.num_envs, 1):
-            raise ValueError(
-                f"actions have shape {values.shape}; they must be ({self.num_envs}, 1), one number "
-                "per world"
-            )
-        values = values[:, 0].astype(np.float64)
-        # Counting is several times faster than `all`.
-        if np.count_nonzero(np.isfinite(values)) < values.size:
-            worlds = np.flatnonzero(~np.isfinite(values)).tolist()
-            raise ValueError(f"actions are not finite in the worlds {worlds}")
-        force: FloatArray = task.applied_force(self.settings, values, np.clip)
+        values = checked_actions(actions, (self.num_envs, 1), "the force of each world")[:, 0]
+        with np.errstate(over="ignore"):
+            force: FloatArray = task.applied_force(self.settings, values, np.clip)
         return force
 
     def _clock(self) -> tuple[FloatArray, FloatArray]:
@@ -314,6 +303,7 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         # Copies of what a restart writes to; the others are made anew in every step.
         info = {
             "success": ~self._open,
+            "is_success": ~self._open,
             "success_time": self._success_time.copy(),
             "inside_tube": self._inside,
             "fallen": self._fallen.copy(),

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -19,9 +21,6 @@ Float32Array = NDArray[np.float32]
 
 NEIGHBOUR_DIM = 4  # relative position and velocity
 OBSTACLE_DIM = 3  # relative position and radius
-# Positions and rates have no bound; the largest float32 says so without an infinity, which
-# Gymnasium's checker takes for a mistake.
-_WIDEST = float(np.finfo(np.float32).max)
 _APART = 16
 
 
@@ -86,17 +85,28 @@ class Layout:
     @property
     def named_space(self) -> spaces.Dict:
         """The parts as a space; `gymnasium.spaces.unflatten` gives them by name."""
-        low = {"neighbour_mask": 0.0, "obstacle_mask": 0.0, "time": 0.0}
-        high = {"neighbour_mask": 1.0, "obstacle_mask": 1.0, "time": self.time_limit}
-        return spaces.Dict(
-            OrderedDict(
-                (
-                    name,
-                    spaces.Box(low.get(name, -_WIDEST), high.get(name, _WIDEST), shape, np.float32),
-                )
-                for name, shape in self.shapes.items()
-            )
+        bounds = {
+            # cos phi and sin phi have bounds, phi has none.
+            "heading": (np.array([-1, -1, -np.inf]), np.array([1, 1, np.inf])),
+            "time": (0.0, self.time_limit),
+            "neighbour_mask": (0.0, 1.0),
+            "obstacle_mask": (0.0, 1.0),
+        }
+        return _boxes(self.shapes, bounds)
+
+
+def _boxes(
+    shapes: Mapping[str, tuple[int, ...]], bounds: Mapping[str, tuple[Any, Any]]
+) -> spaces.Dict:
+    """Return a box for each part, in their order; what has no bounds is unbounded."""
+    boxes: OrderedDict[str, spaces.Space[Any]] = OrderedDict()
+    for name, shape in shapes.items():
+        low, high = (
+            np.broadcast_to(bound, shape).astype(np.float32)
+            for bound in bounds.get(name, (-np.inf, np.inf))
         )
+        boxes[name] = spaces.Box(low, high)
+    return spaces.Dict(boxes)
 
 
 def observation_columns(world: SpacecraftWorld, layout: Layout) -> Float32Array:
@@ -188,15 +198,14 @@ def named_state_space(agents: int, obstacles: int, time_limit: float) -> spaces.
     with centre and radius, (obstacles, 3) [m]; and `obstacle_mask`, (obstacles,).
     """
     slots = max(1, obstacles)
-    return spaces.Dict(
-        OrderedDict(
-            time=spaces.Box(0.0, time_limit, (1,), np.float32),
-            states=spaces.Box(-_WIDEST, _WIDEST, (agents, STATE_DIM), np.float32),
-            goals=spaces.Box(-_WIDEST, _WIDEST, (agents, 2), np.float32),
-            obstacles=spaces.Box(-_WIDEST, _WIDEST, (slots, OBSTACLE_DIM), np.float32),
-            obstacle_mask=spaces.Box(0.0, 1.0, (slots,), np.float32),
-        )
+    shapes = OrderedDict(
+        time=(1,),
+        states=(agents, STATE_DIM),
+        goals=(agents, 2),
+        obstacles=(slots, OBSTACLE_DIM),
+        obstacle_mask=(slots,),
     )
+    return _boxes(shapes, {"time": (0.0, time_limit), "obstacle_mask": (0.0, 1.0)})
 
 
 def global_state(world: SpacecraftWorld) -> Float32Array:

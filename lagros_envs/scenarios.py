@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -19,6 +20,7 @@ from lagros_envs.checks import (
     shown,
     suggestion,
 )
+from lagros_envs.conventions import built_like
 from lagros_envs.files import write_atomic
 from lagros_envs.reachable import way_exists
 from lagros_envs.reading import Record
@@ -300,15 +302,15 @@ PRESETS: dict[str, Preset] = {
 }
 
 
-def preset_named(preset: str | Preset) -> Preset:
-    """Return a preset by its name; a preset stays as it is.
+def preset_named(preset: str | Preset | Mapping[str, Any]) -> Preset:
+    """Return a preset by its name, or from a dictionary of its fields; a preset stays as it is.
 
     Raises:
-        ValueError: The name is unknown.
+        ValueError: The name or a field is unknown, or a value is out of range.
     """
-    if isinstance(preset, Preset):
-        return preset
-    if not isinstance(preset, str) or preset not in PRESETS:
+    if not isinstance(preset, str):
+        return built_like(PRESETS["paper"], preset, "preset")
+    if preset not in PRESETS:
         raise ValueError(
             f"preset={shown(preset)} is not known; use one of {', '.join(PRESETS)}, or a "
             f"lagros_envs.scenarios.Preset.{suggestion(preset, PRESETS)}"

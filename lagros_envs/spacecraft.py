@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -10,24 +10,35 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
+from pettingzoo.utils.env_logger import EnvLogger
 
 from lagros_envs import spacecraft_task as task
+from lagros_envs.conventions import (
+    RENDER_MODES,
+    Conforming,
+    check_render_mode,
+    plain_seed,
+    settings_of,
+)
 from lagros_envs.observation import global_state, named_state_space, observe
+from lagros_envs.options import checked_actions
 from lagros_envs.scenarios import Preset, Scenario
 from lagros_envs.spacecraft_episode import (
-    RENDER_MODES,
     SpacecraftDrawing,
     SpacecraftEpisode,
     action_space,
-    check_render_mode,
     one_info,
 )
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
+# What PettingZoo's own tests pass to the reset of any environment.
+_OF_CHECKERS = {"options": 1}
 
 
-class SpacecraftParallelEnv(SpacecraftDrawing, ParallelEnv[str, Float32Array, Float32Array]):
+class SpacecraftParallelEnv(
+    SpacecraftDrawing, Conforming, ParallelEnv[str, Float32Array, Float32Array]
+):
     """Spacecraft that seek their goals among obstacles and each other, under bounded disturbance.
 
     ## Action
@@ -64,7 +75,7 @@ class SpacecraftParallelEnv(SpacecraftDrawing, ParallelEnv[str, Float32Array, Fl
     ## Starting state
     Drawn from the preset, at rest. `reset(options=...)` takes `scenario`, a
     `lagros_envs.scenarios.Scenario`, and `nominal`, x_d of all agents at every control instant,
-    shape (steps + 1, agents, 6).
+    shape (steps + 1, agents, 6). A reset that is refused leaves the environment as it was.
 
     ## Episode end
     `truncated` for all agents at 45 s, `terminated` for all as soon as all have collided. Arriving
@@ -74,22 +85,25 @@ class SpacecraftParallelEnv(SpacecraftDrawing, ParallelEnv[str, Float32Array, Fl
 
     ## Info
     For each agent `success` (it came within `settings.goal_radius` of its goal at a control instant
-    before any collision of its own), `success_time` [s] (inf before), `strict_success` (it is there
-    now and has never collided; at the end this is the strict measure), `paper_success` and its time
-    (||(p - p_f, v)|| <= r(t) of the published tube before any collision), `collided`,
+    before any collision of its own), `is_success` (the same, by the name that other libraries
+    read), `success_time` [s] (inf before), `strict_success` (it is there now and has never
+    collided; at the end this is the strict measure), `paper_success` and its time (||(p - p_f, v)||
+    <= r(t) of the published tube before any collision), `collided`,
     `collision_time`, `effort` (the integral of ||u||^2 so far), `effort_to_success` (the same,
     frozen at the first success), `disturbance` (d of the step), `tube_radius` r(t), `goal_distance`
     and, where the episode has a nominal, `tracking_error` ||x - x_d||.
 
     Args:
         num_agents: Number of agents; None for the preset's own.
-        preset: A name of `lagros_envs.scenarios.PRESETS`, or a `Preset`.
+        preset: A name of `lagros_envs.scenarios.PRESETS`, a `Preset`, or a dictionary of those
+            fields that differ from the defaults.
         disturbance: Kind of disturbance, one of `lagros_envs.disturbances.KINDS`, or a function of
             a `Situation`, which sees all agents at once.
         disturbance_bound: d_bar, in units of the state per second.
         disturbance_channels: "all", "rates", or a mask of the six states.
         metric: Contraction metric M for the kind "worst": (6, 6), or a function of the state.
-        settings: The task.
+        settings: The task: a `SpacecraftSettings`, or a dictionary of those fields that differ from
+            the defaults.
         max_cycles: Control steps of an episode, in place of `settings.time_limit`.
         render_mode: None, "human" or "rgb_array".
 
@@ -97,6 +111,7 @@ class SpacecraftParallelEnv(SpacecraftDrawing, ParallelEnv[str, Float32Array, Fl
         ValueError: A setting is not valid.
     """
 
+    settings: task.SpacecraftSettings
     metadata = {
         "name": "spacecraft_v0",
         "render_modes": list(RENDER_MODES),
@@ -107,18 +122,18 @@ class SpacecraftParallelEnv(SpacecraftDrawing, ParallelEnv[str, Float32Array, Fl
     def __init__(
         self,
         num_agents: int | None = None,
-        preset: str | Preset = "paper",
+        preset: str | Preset | Mapping[str, Any] = "paper",
         disturbance: str | Any = "none",
         disturbance_bound: float = 0.4,
         disturbance_channels: Literal["all", "rates"] | Sequence[bool] = "all",
         metric: Any = None,
-        settings: task.SpacecraftSettings | None = None,
+        settings: task.SpacecraftSettings | Mapping[str, Any] | None = None,
         max_cycles: int | None = None,
         render_mode: str | None = None,
     ) -> None:
         """Build the environment; see the class for the arguments."""
         self.render_mode = check_render_mode(render_mode)
-        settings = task.limited(settings or task.SpacecraftSettings(), max_cycles)
+        settings = task.limited(settings_of(task.SpacecraftSettings(), settings), max_cycles)
         self.episode = SpacecraftEpisode(
             num_agents,
             preset,
@@ -170,13 +185,14 @@ class SpacecraftParallelEnv(SpacecraftDrawing, ParallelEnv[str, Float32Array, Fl
             Observations and infos, by agent.
 
         Raises:
-            ValueError: An option has a wrong type, shape or value.
+            ValueError: The seed is none, or an option is unknown or has a wrong type, shape or
+                value.
         """
+        given = self.episode.checked(None if options == _OF_CHECKERS else options)
+        seed = plain_seed(seed)
         if seed is not None or self._np_random is None:
             self._np_random, _ = seeding.np_random(seed)
-        if seed is None:
-            seed = int(self._np_random.integers(2**63))
-        self.episode.start(seed, options or {})
+        self.episode.start(int(self._np_random.integers(2**63)) if seed is None else seed, given)
         self.agents = self.possible_agents[:]
         if self.render_mode == "human":
             self.render()
@@ -197,19 +213,25 @@ class SpacecraftParallelEnv(SpacecraftDrawing, ParallelEnv[str, Float32Array, Fl
             actions: For each agent its thrust in units of `settings.thrust_scale`, shape (8,).
 
         Returns:
-            Observations, rewards, terminations, truncations and infos, by agent.
+            Observations, rewards, terminations, truncations and infos, by agent. After the end of
+            an episode there are no agents, and these are empty; PettingZoo's logger warns.
 
         Raises:
             ValueError: An agent is missing or unknown, or an action is not eight finite numbers.
-            RuntimeError: The environment was not reset, or its episode is over.
+            RuntimeError: The environment was not reset.
         """
         self.episode.need_start()
+        if not isinstance(actions, Mapping):
+            raise ValueError(
+                f"the actions are {type(actions).__name__}; give a dictionary by agent"
+            )
         if not self.agents:
-            raise RuntimeError("the episode is over; call reset() before step()")
+            EnvLogger.warn_step_after_terminated_truncated()
+            return {}, {}, {}, {}, {}
         forces = np.stack([self._force(actions, agent) for agent in self.agents])
         for agent in actions:
             self._known(agent)
-        outcome = self.episode.world.step(forces[None])
+        outcome = self.episode.step(forces)
         agents = self.agents
         rewards, terminations, truncations = (
             dict(zip(agents, part[0].tolist(), strict=True)) for part in outcome
@@ -254,7 +276,7 @@ class SpacecraftParallelEnv(SpacecraftDrawing, ParallelEnv[str, Float32Array, Fl
                 f"the actions lack {agent!r}; give one to each of {', '.join(self.agents)}"
             )
         try:
-            values = task.checked_actions(actions[agent], (task.THRUSTERS,))
+            values = checked_actions(actions[agent], (task.THRUSTERS,), task.ACTION)
         except ValueError as error:
             raise ValueError(f"{agent}: {error}") from None
         return task.applied_forces(self.settings, values)

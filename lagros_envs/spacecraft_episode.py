@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -11,15 +11,15 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
+from lagros_envs.conventions import End, settings_of, warned_after
 from lagros_envs.disturbances import Disturbance, channel_mask
 from lagros_envs.observation import Layout
+from lagros_envs.options import known_options
 from lagros_envs.scenarios import Preset, Scenario, preset_named
 from lagros_envs.seeding import episode_streams
-from lagros_envs.spacecraft_world import SpacecraftWorld
+from lagros_envs.spacecraft_world import Outcome, SpacecraftWorld
 
 FloatArray = NDArray[np.float64]
-
-RENDER_MODES = ("human", "rgb_array")
 
 
 class SpacecraftEpisode:
@@ -27,12 +27,12 @@ class SpacecraftEpisode:
 
     Args:
         num_agents: Number of agents; None for the preset's own.
-        preset: A name of `lagros_envs.scenarios.PRESETS`, or a `Preset`.
+        preset: As in `SpacecraftParallelEnv`.
         disturbance: As in `SpacecraftParallelEnv`.
         disturbance_bound: As in `SpacecraftParallelEnv`.
         disturbance_channels: As in `SpacecraftParallelEnv`.
         metric: As in `SpacecraftParallelEnv`.
-        settings: The task.
+        settings: As in `SpacecraftParallelEnv`.
         worlds: Number of worlds.
         compiled: As in `SpacecraftWorld`.
 
@@ -43,17 +43,17 @@ class SpacecraftEpisode:
     def __init__(
         self,
         num_agents: int | None,
-        preset: str | Preset,
+        preset: str | Preset | Mapping[str, Any],
         disturbance: str | Any,
         disturbance_bound: float,
         disturbance_channels: Literal["all", "rates"] | Sequence[bool],
         metric: Any,
-        settings: task.SpacecraftSettings | None,
+        settings: task.SpacecraftSettings | Mapping[str, Any] | None,
         worlds: int = 1,
         compiled: bool | None = False,
     ) -> None:
         """Build the worlds."""
-        self.settings = settings or task.SpacecraftSettings()
+        self.settings = settings_of(task.SpacecraftSettings(), settings)
         self.preset = preset_named(preset).for_agents(num_agents)
         self.disturbance = Disturbance(
             disturbance, disturbance_bound, channel_mask(disturbance_channels, task.RATES), metric
@@ -68,22 +68,65 @@ class SpacecraftEpisode:
         )
         self.layout = Layout.of(self.world)
         self.started = False
+        self.end = End.NOT_YET
 
-    def start(self, seed: int, options: dict[str, Any]) -> None:
-        """Start the episode of a seed, or of the scenario that the options hold.
+    def checked(self, options: Mapping[str, Any] | None) -> dict[str, Any]:
+        """Check the options of a reset of one world, and return what `start` is to start from.
 
         Raises:
-            ValueError: An option has a wrong type, shape or value.
+            ValueError: An option is unknown, or has a wrong type, shape or value.
         """
-        streams = episode_streams(seed)
-        scenario = scenario_from_options(options)
+        options = known_options(options, task.OPTIONS)
         nominal = task.nominal_from_options(options, self.settings, (self.preset.agents,))
         self.need_nominal(nominal)
-        if scenario is None:
-            scenario = self.preset.sample(streams.scenario)
-        self.world.nominal = None if nominal is None else nominal[None]
+        scenario = self.checked_scenario("scenario", options.get("scenario"))
+        return {"nominal": nominal, "scenario": scenario}
+
+    def start(self, seed: int, given: dict[str, Any]) -> None:
+        """Start the episode of a seed, or of the scenario that was given.
+
+        Args:
+            seed: Seed of the episode.
+            given: What `checked` returned.
+
+        Raises:
+            ValueError: No scenario has the density of the preset.
+        """
+        streams = episode_streams(seed)
+        scenario = given["scenario"] or self.preset.sample(streams.scenario)
+        nominal = given["nominal"]
         self.world.begin(np.zeros(1, np.intp), [scenario], [streams.disturbance])
-        self.started = True
+        self.world.nominal = None if nominal is None else nominal[None]
+        self.started, self.end = True, End.NOT_YET
+
+    def step(self, forces: FloatArray) -> Outcome:
+        """Hold the forces (agents, 8) [N] in the one world for a control step."""
+        if self.end is not End.NOT_YET:
+            self.end = warned_after(self.end)
+        outcome = self.world.step(forces[None])
+        if self.end is End.NOT_YET and (outcome.terminated.any() or outcome.truncated.any()):
+            self.end = End.REACHED
+        return outcome
+
+    def checked_scenario(self, name: str, scenario: Any) -> Scenario | None:
+        """Return a scenario that fits into these worlds, or None for none.
+
+        Args:
+            name: Of the option that holds it.
+            scenario: What it holds.
+
+        Raises:
+            ValueError: It is not a `Scenario`, or does not fit.
+        """
+        if scenario is None:
+            return None
+        if not isinstance(scenario, Scenario):
+            raise ValueError(
+                f"options[{name!r}] has a {type(scenario).__name__}; it must be a "
+                "lagros_envs.scenarios.Scenario (Scenario.load reads one from a file)"
+            )
+        self.world.check(scenario)
+        return scenario
 
     def need_nominal(self, nominal: FloatArray | None) -> None:
         """Refuse the kind "worst" without a plan.
@@ -105,34 +148,6 @@ class SpacecraftEpisode:
         """
         if not self.started:
             raise RuntimeError("call reset() before step()")
-
-
-def scenario_from_options(options: dict[str, Any]) -> Scenario | None:
-    """Return the scenario of the options, or None.
-
-    Raises:
-        ValueError: It is not a `Scenario`.
-    """
-    scenario = options.get("scenario")
-    if scenario is not None and not isinstance(scenario, Scenario):
-        raise ValueError(
-            f"options['scenario'] is a {type(scenario).__name__}; it must be a "
-            "lagros_envs.scenarios.Scenario (Scenario.load reads one from a file)"
-        )
-    return scenario
-
-
-def check_render_mode(render_mode: str | None) -> str | None:
-    """Return a render mode that is known.
-
-    Raises:
-        ValueError: It is not.
-    """
-    if render_mode is not None and render_mode not in RENDER_MODES:
-        raise ValueError(
-            f"render_mode={render_mode!r} is not known; use one of {list(RENDER_MODES)} or None"
-        )
-    return render_mode
 
 
 class SpacecraftDrawing:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, cast
 
 import gymnasium as gym
@@ -11,14 +11,14 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
+from lagros_envs.conventions import RENDER_MODES, Conforming, check_render_mode, plain_seed
 from lagros_envs.observation import observe
+from lagros_envs.options import checked_actions, real_numbers
 from lagros_envs.scenarios import Preset, Scenario
 from lagros_envs.spacecraft_episode import (
-    RENDER_MODES,
     SpacecraftDrawing,
     SpacecraftEpisode,
     action_space,
-    check_render_mode,
     one_info,
 )
 
@@ -26,12 +26,13 @@ FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
 
-class SpacecraftEnv(SpacecraftDrawing, gym.Env[Float32Array, Float32Array]):
+class SpacecraftEnv(SpacecraftDrawing, Conforming, gym.Env[Float32Array, Float32Array]):
     """One spacecraft that seeks its goal among obstacles, under bounded disturbance.
 
     The world, action, observation, reward and info of `spacecraft.SpacecraftParallelEnv` with a
     single agent: the one slot for a neighbour is always empty. `terminated` at a collision,
-    `truncated` at 45 s; the episode goes on after the arrival.
+    `truncated` at 45 s; the episode goes on after the arrival. `max_episode_steps` of `gym.make` is
+    as in `CartPoleEnv`.
 
     `reset(options=...)` takes `scenario`, a `lagros_envs.scenarios.Scenario` of one agent, and
     `nominal`, x_d at every control instant, shape (steps + 1, 6).
@@ -42,23 +43,24 @@ class SpacecraftEnv(SpacecraftDrawing, gym.Env[Float32Array, Float32Array]):
         disturbance_bound: As in `SpacecraftParallelEnv`.
         disturbance_channels: As in `SpacecraftParallelEnv`.
         metric: As in `SpacecraftParallelEnv`.
-        settings: The task.
+        settings: As in `SpacecraftParallelEnv`.
         render_mode: None, "human" or "rgb_array".
 
     Raises:
         ValueError: A setting is not valid.
     """
 
+    settings: task.SpacecraftSettings
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}
 
     def __init__(
         self,
-        preset: str | Preset = "paper",
+        preset: str | Preset | Mapping[str, Any] = "paper",
         disturbance: str | Any = "none",
         disturbance_bound: float = 0.4,
         disturbance_channels: Literal["all", "rates"] | Sequence[bool] = "all",
         metric: Any = None,
-        settings: task.SpacecraftSettings | None = None,
+        settings: task.SpacecraftSettings | Mapping[str, Any] | None = None,
         render_mode: str | None = None,
     ) -> None:
         """Build the environment; see the class for the arguments."""
@@ -87,16 +89,13 @@ class SpacecraftEnv(SpacecraftDrawing, gym.Env[Float32Array, Float32Array]):
             The observation and the info.
 
         Raises:
-            ValueError: An option has a wrong type, shape or value.
+            ValueError: The seed is none, or an option is unknown or has a wrong type, shape or
+                value.
         """
+        given = self.episode.checked(_with_agents(options))
+        seed = plain_seed(seed)
         super().reset(seed=seed)
-        if seed is None:
-            seed = int(self.np_random.integers(2**63))
-        options = dict(options or {})
-        nominal = options.get("nominal")
-        if nominal is not None and np.ndim(nominal) == 2:
-            options["nominal"] = np.asarray(nominal)[:, None]
-        self.episode.start(seed, options)
+        self.episode.start(int(self.np_random.integers(2**63)) if seed is None else seed, given)
         if self.render_mode == "human":
             self.render()
         return self._observation(), self._info()
@@ -115,9 +114,8 @@ class SpacecraftEnv(SpacecraftDrawing, gym.Env[Float32Array, Float32Array]):
             RuntimeError: The environment was not reset.
         """
         self.episode.need_start()
-        values = task.checked_actions(action, (task.THRUSTERS,))
-        forces = task.applied_forces(self.settings, values)
-        outcome = self.episode.world.step(forces[None, None])
+        values = checked_actions(action, (task.THRUSTERS,), task.ACTION)
+        outcome = self.episode.step(task.applied_forces(self.settings, values)[None])
         if self.render_mode == "human":
             self.render()
         return (
@@ -149,3 +147,13 @@ class SpacecraftEnv(SpacecraftDrawing, gym.Env[Float32Array, Float32Array]):
 
     def _info(self) -> dict[str, Any]:
         return one_info(self.episode.world.info(), 0)
+
+
+def _with_agents(options: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """Give a nominal (steps + 1, 6) the axis of the one agent."""
+    if not isinstance(options, Mapping):
+        return options
+    nominal = real_numbers(options.get("nominal"))
+    if nominal is None or nominal.ndim != 2:
+        return options
+    return {**options, "nominal": nominal[:, None]}

@@ -30,8 +30,13 @@ THRUSTERS = 8
 RATES = (False, False, False, True, True, True)
 # Beyond this, in units of the state, the integration has diverged under an enormous force.
 LARGEST_STATE = 1e12
-# No force is larger [N], whatever the action: its square, the effort, stays a number.
-LARGEST_FORCE = 1e100
+# No force is larger [N], whatever the action: the effort of an episode stays a number, in single
+# precision as well.
+LARGEST_FORCE = 1e16
+# What an action is, for messages.
+ACTION = "one per thruster"
+# What `reset(options=...)` of one world may hold.
+OPTIONS = ("scenario", "nominal")
 
 
 @dataclass(frozen=True)
@@ -109,32 +114,6 @@ def applied_forces(settings: SpacecraftSettings, actions: Any) -> FloatArray:
         forces = settings.thrust_scale * np.asarray(actions, dtype=np.float64)
     limit = settings.thrust_limit
     return np.clip(forces, 0.0, LARGEST_FORCE if limit is None else limit)
-
-
-def checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[np.floating[Any]]:
-    """Return the actions as an array.
-
-    Args:
-        actions: What a user passed to step.
-        shape: The shape that they must have; the last axis is that of the thrusters.
-
-    Returns:
-        The actions.
-
-    Raises:
-        ValueError: They have another shape or are not finite.
-    """
-    values = np.asarray(actions)
-    if values.shape != shape or values.dtype.kind not in "fiu":
-        raise ValueError(
-            f"the action has shape {values.shape} and type {values.dtype}; it must be numbers of "
-            f"shape {shape}, one per thruster"
-        )
-    if not np.all(np.isfinite(values)):
-        rows = np.unique(np.nonzero(~np.isfinite(values))[0]).tolist()
-        where = f" in the rows {rows}" if values.ndim > 1 else ""
-        raise ValueError(f"the action is not finite{where}; every thruster needs a finite number")
-    return values
 
 
 def nominal_from_options(

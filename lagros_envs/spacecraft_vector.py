@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -19,9 +19,10 @@ from lagros_envs.observation import (
     observation_columns,
     observe,
 )
+from lagros_envs.options import checked_actions
 from lagros_envs.scenarios import Preset, Scenario
 from lagros_envs.seeding import episode_streams
-from lagros_envs.spacecraft_episode import SpacecraftEpisode, action_space, scenario_from_options
+from lagros_envs.spacecraft_episode import SpacecraftEpisode, action_space
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -49,6 +50,7 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         metric: As in `SpacecraftParallelEnv`.
         settings: The task.
         compiled: As in `CartPoleVectorEnv`.
+        max_episode_steps: As in `autoreset.RestartingVectorEnv`.
         autoreset_mode: As in `autoreset.RestartingVectorEnv`.
         render_mode: Must be None; render a single environment instead.
 
@@ -60,19 +62,23 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         ImportError: `compiled=True` and numba is not installed.
     """
 
+    settings: task.SpacecraftSettings
+    option_names = ("reset_mask", "scenarios", "nominal")
+
     def __init__(
         self,
         num_envs: int = 1,
         num_agents: int = 1,
-        preset: str | Preset = "paper",
+        preset: str | Preset | Mapping[str, Any] = "paper",
         disturbance: str | Any = "none",
         disturbance_bound: float = 0.4,
         disturbance_channels: Literal["all", "rates"] | Sequence[bool] = "all",
         metric: Any = None,
-        settings: task.SpacecraftSettings | None = None,
+        settings: task.SpacecraftSettings | Mapping[str, Any] | None = None,
         compiled: bool | None = None,
         autoreset_mode: Literal["next_step", "same_step", "disabled"] | AutoresetMode = "next_step",
         render_mode: str | None = None,
+        max_episode_steps: int | None = None,
     ) -> None:
         """Build the worlds; see the class for the arguments."""
         check_whole("num_agents", num_agents)
@@ -107,10 +113,13 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
             spaces.flatten_space(self.named_space),
             action_space(),
             self.episode.disturbance,
+            self.settings,
+            max_episode_steps,
             autoreset_mode,
             render_mode,
             "spacecraft_v0.parallel_env(render_mode=...)",
         )
+        self.world.step_limit = self.step_limit
 
     def step(
         self, actions: Float32Array
@@ -129,7 +138,7 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
             RuntimeError: The environment was not reset.
         """
         self._need_start()
-        values = task.checked_actions(actions, (self.num_envs, task.THRUSTERS))
+        values = checked_actions(actions, (self.num_envs, task.THRUSTERS), task.ACTION)
         forces = task.applied_forces(self.settings, values)
         restarting = self._restart_pending()
         outcome = self.world.step(
@@ -159,33 +168,38 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         """The scenario of each world."""
         return list(self.world.scenarios)
 
-    def _scenarios(self, options: dict[str, Any]) -> list[Scenario | None]:
-        given = options.get("scenarios")
-        if given is None:
-            return [None] * self.num_worlds
-        if len(given) != self.num_worlds:
-            raise ValueError(
-                f"options['scenarios'] has {len(given)} entries; it must have {self.num_worlds}, "
-                "one per world"
-            )
-        return [scenario_from_options({"scenario": scenario}) for scenario in given]
-
-    def _set_nominal(self, mask: BoolArray, options: dict[str, Any]) -> None:
-        given = task.nominal_from_options(
+    def _checked(self, mask: BoolArray, options: dict[str, Any]) -> dict[str, Any]:
+        nominal = task.nominal_from_options(
             options, self.settings, (self.num_worlds, self.num_agents), mask
         )
-        self.episode.need_nominal(given)
+        self.episode.need_nominal(nominal)
+        return {"nominal": nominal, "scenarios": self._scenarios(mask, options.get("scenarios"))}
+
+    def _scenarios(self, mask: BoolArray, given: Any) -> list[Scenario | None]:
+        if given is None:
+            return [None] * self.num_worlds
+        if not isinstance(given, Sequence) or len(given) != self.num_worlds:
+            raise ValueError(
+                f"options['scenarios'] must have {self.num_worlds} entries, a `Scenario` or None "
+                "per world"
+            )
+        return [
+            self.episode.checked_scenario("scenarios", one) if starts else None
+            for one, starts in zip(given, mask, strict=True)
+        ]
+
+    def _set_nominal(self, mask: BoolArray, given: dict[str, Any]) -> None:
         kept = None if mask.all() else self.world.nominal
-        self.world.nominal = nominal_after(kept, mask, given)
+        self.world.nominal = nominal_after(kept, mask, given["nominal"])
 
     def _forget_nominal(self, mask: BoolArray) -> None:
         self.world.nominal = nominal_after(self.world.nominal, mask, None)
 
-    def _start(self, worlds: IntArray, seeds: Sequence[int], options: dict[str, Any]) -> None:
-        given = self._scenarios(options)
+    def _start(self, worlds: IntArray, seeds: Sequence[int], given: dict[str, Any]) -> None:
+        stated = given.get("scenarios", [None] * self.num_worlds)
         streams = [episode_streams(seed) for seed in seeds]
         chosen = [
-            given[world] or self.preset.sample(stream.scenario)
+            stated[world] or self.preset.sample(stream.scenario)
             for world, stream in zip(worlds, streams, strict=True)
         ]
         self.world.begin(worlds, chosen, [stream.disturbance for stream in streams])

@@ -57,6 +57,7 @@ class SpacecraftWorld:
 
     Attributes:
         compiled: Whether it is compiled.
+        step_limit: Control steps after which an episode is truncated.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class SpacecraftWorld:
         """Allocate the worlds; `begin` starts them."""
         self.worlds, self.agents, self.obstacles = worlds, agents, obstacles
         self.disturbance, self.settings = disturbance, settings
+        self.step_limit = settings.steps
         shape = (worlds, agents)
         substep = settings.control_period / SUBSTEPS
         self._hold = HeldBatch(settings.system.by_wrench, substep, shape, compiled, 1)
@@ -146,7 +148,7 @@ class SpacecraftWorld:
             ValueError: A scenario has another number of agents, or too many obstacles.
         """
         for scenario in scenarios:
-            self._check(scenario)
+            self.check(scenario)
         settings = self.settings
         for world, scenario, generator in zip(worlds, scenarios, generators, strict=True):
             count = len(scenario.obstacles)
@@ -212,7 +214,7 @@ class SpacecraftWorld:
         first_success = self._note_arrivals(after, going)
         rewards = task.reward(settings, effort, before - after, first_success, first_collision)
         over = going & np.all(self.collided, axis=1)
-        late = going & (self.step_count >= settings.steps)
+        late = going & (self.step_count >= self.step_limit)
         if moving is not None:
             rewards = np.where(going[:, None], rewards, 0.0)
         return Outcome(
@@ -231,6 +233,7 @@ class SpacecraftWorld:
         radius = self.settings.tube.radius(self.time)
         info = {
             "success": np.isfinite(self.success_time),
+            "is_success": np.isfinite(self.success_time),
             "success_time": self.success_time.copy(),
             "strict_success": (distance <= self.settings.goal_radius) & ~collided,
             "paper_success": np.isfinite(self.paper_success_time),
@@ -255,7 +258,12 @@ class SpacecraftWorld:
         index = np.minimum(self.step_count, self.settings.steps)
         return self.nominal[self._everywhere, index]
 
-    def _check(self, scenario: Scenario) -> None:
+    def check(self, scenario: Scenario) -> None:
+        """Check that a scenario fits into these worlds.
+
+        Raises:
+            ValueError: It has another number of agents, or too many obstacles.
+        """
         if scenario.num_agents != self.agents:
             raise ValueError(
                 f"the scenario has {scenario.num_agents} agents; this environment was built with "

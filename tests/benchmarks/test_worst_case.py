@@ -270,7 +270,7 @@ def test_replay_is_the_given_sequence(episodes: cartpole.Episodes) -> None:
     env: Any = gym.make(
         "lagros/CartPole-v0", disturbance=Replay(pushes, 0.1), disturbance_bound=0.4
     ).unwrapped
-    env.reset(seed=0)
+    env.reset(seed=0, options={"initial_state": np.zeros(4)})
     met = [env.step(np.zeros(1, np.float32))[4]["disturbance"] for _ in range(5)]
     np.testing.assert_allclose(met, pushes[:5], rtol=1e-12)
     with pytest.raises(ValueError, match="must be finite"):

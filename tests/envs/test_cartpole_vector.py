@@ -443,9 +443,9 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        (np.zeros(3), r"shape \(3,\); they must be \(3, 1\)"),
+        (np.zeros(3), r"shape \(3,\); it must be numbers of shape \(3, 1\)"),
         (np.zeros((2, 1)), r"shape \(2, 1\)"),
-        (np.array([[0.0], [np.nan], [np.inf]]), r"not finite in the worlds \[1, 2\]"),
+        (np.array([[0.0], [np.nan], [np.inf]]), r"not finite in the rows \[1, 2\]"),
     ],
 )
 def test_actions_that_make_no_sense_are_refused(actions, message):
@@ -522,6 +522,7 @@ def test_worst_says_that_an_autoreset_has_no_nominal():
         env.step(still)
 
 
+@pytest.mark.filterwarnings("ignore:.*even though this environment has already")
 def test_whoever_goes_on_past_the_time_limit_still_has_the_tube():
     """Every world, alone or among others, at any time and each at its own."""
     envs = gym.make_vec("lagros/CartPole-v0", num_envs=2, autoreset_mode="disabled")

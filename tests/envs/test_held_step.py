@@ -239,6 +239,8 @@ print(run(*[0.1] * 9), sum(run.stats.cache_hits.values()))
     assert list(tmp_path.glob("lagros/*.py"))
 
 
+# The episode goes on after the force that nothing stands under.
+@pytest.mark.filterwarnings("ignore:.*even though this environment has already")
 @needs_numba
 @pytest.mark.parametrize("kind", ["none", "gust"])
 def test_a_compiled_environment_flies_the_same_episode(kind, hold):

@@ -24,6 +24,7 @@ from lagros_benchmarks.training.run import rounded
 from lagros_benchmarks.training.settings import CURVE, FINAL, CartPoleTraining, OffPolicy
 from lagros_envs import cartpole_task as task
 from lagros_envs.cartpole_vector import CartPoleVectorEnv
+from lagros_envs.conventions import beyond_the_end
 from lagros_envs.seeding import episode_seeds
 from lagros_policies.actor import Actor, ActorPolicy, goal_frame
 from lagros_policies.lagros import LagrosPolicy
@@ -234,7 +235,9 @@ def evaluate(policy: Any, seeds: list[int], disturbance: str, bound: float) -> d
     last = {key: np.array(info[key]) for key in ("success", "effort", "effort_to_success")}
     for _ in range(policy.settings.steps):
         action, _ = policy.predict(observation)
-        observation, reward, terminated, _, info = venv.step(np.where(fallen[:, None], 0.0, action))
+        action = np.where(fallen[:, None], 0.0, action)
+        with beyond_the_end():
+            observation, reward, terminated, _, info = venv.step(action)
         rewards += np.where(fallen, 0.0, reward)
         for key, values in last.items():
             values[~fallen] = info[key][~fallen]

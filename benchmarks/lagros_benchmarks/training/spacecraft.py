@@ -24,6 +24,7 @@ from lagros_benchmarks.training.agent import actor_network
 from lagros_benchmarks.training.run import rounded
 from lagros_benchmarks.training.settings import CURVE, FINAL, SpacecraftTraining
 from lagros_envs import spacecraft_v0
+from lagros_envs.conventions import beyond_the_end
 from lagros_envs.observation import Layout
 from lagros_envs.scenarios import preset_named
 from lagros_envs.seeding import episode_seeds
@@ -296,7 +297,8 @@ def evaluate(
     observation, info = env.reset(seed=list(seeds))
     for _ in range(policy.settings.steps):
         action, _ = policy.predict(observation)
-        observation, _, _, _, info = env.step(action)
+        with beyond_the_end():
+            observation, _, _, _, info = env.step(action)
     return {name: info[name] for name in (*RATES, "effort_to_success", "success_time")}
 
 

@@ -18,6 +18,7 @@ from lagros_benchmarks.flying import Attempt, reseed
 from lagros_benchmarks.library import Policy
 from lagros_benchmarks.spacecraft_episodes import act, bare, is_global, plans_of
 from lagros_envs import spacecraft_task as task
+from lagros_envs.conventions import beyond_the_end
 from lagros_envs.disturbances import Situation, onto_unit_sphere
 from lagros_envs.scenarios import Scenario
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
@@ -236,7 +237,8 @@ class SpacecraftTarget:
             if step == 0:
                 nominal = _nominal_of(state, env)
                 error = None if nominal is None else np.zeros(shape)
-            rows, _, _, _, info = env.step(action)
+            with beyond_the_end():
+                rows, _, _, _, info = env.step(action)
             pushes[:, step] = info["disturbance"].reshape(*shape, task.STATE_DIM)
             gap = np.minimum(gap, least_gap(env.states[..., :2], scene))
             whole = ~info["collided"].reshape(shape)
