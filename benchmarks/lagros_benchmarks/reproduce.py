@@ -1,6 +1,6 @@
 """The cart-pole experiment from nothing: metric, expert data, networks (a) and (c).
 
-Every stage leaves a file in the run's folder and is skipped where that file is there, so that an
+Every stage leaves a file in the run's folder and is skipped where that file is whole, so that an
 interrupted run goes on where it was. The same settings give the same files, bit for bit on one
 machine.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.experiment import Progress
-from lagros_benchmarks.reproduction import Say
+from lagros_benchmarks.reproduction import Say, made_before
 from lagros_benchmarks.settings import BenchmarkSettings
 from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.checks import check_fields
@@ -142,9 +142,10 @@ def _metric(
     path = folder / "metric.json"
     begun = perf_counter()
     update("metric", 0, 1)
-    if not path.exists():
+    metric = made_before(lambda: load_metric(path), note)
+    if metric is None:
         save_metric(design_cartpole_metric(settings.metric, task), path)
-    metric = load_metric(path)
+        metric = load_metric(path)
     update("metric", 1, 1)
     check = metric.verification
     if check is not None:
@@ -166,13 +167,13 @@ def _network(
     update: Progress,
     note: Say,
 ) -> None:
-    """Fit one network, unless its file is there, and write its training record beside it."""
+    """Fit one network, unless its file is whole, and write its training record beside it."""
     weights = _weights(folder, name)
     features, side = cartpole_features(observation.astype(np.float32))
     labels: Float32Array = (control * side[:, None]).astype(np.float32)
     held_out = _held_out(plan, training.held_out)
     begun = perf_counter()
-    if not weights.exists():
+    if made_before(lambda: Mlp.load(weights), note) is None:
         network = fit(
             features[~held_out],
             labels[~held_out],

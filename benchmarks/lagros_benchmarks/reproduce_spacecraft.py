@@ -2,7 +2,7 @@
 
 The networks of (c) are fitted in rounds: the first to flights of the expert, each later one also to
 what the one before it met when it flew, labelled by the expert (DAgger). Every stage leaves its
-files in the run's folder and is skipped where they are there. The same settings give the same
+files in the run's folder and is skipped where they are whole. The same settings give the same
 files, bit for bit on one machine.
 """
 
@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lagros_benchmarks.experiment import Progress
-from lagros_benchmarks.reproduction import Say
+from lagros_benchmarks.reproduction import Say, made_before
 from lagros_benchmarks.settings import BenchmarkSettings
 from lagros_envs.checks import check_fields
 from lagros_envs.files import write_atomic
@@ -178,10 +178,10 @@ class _Stage:
     def fit(
         self, name: str, training: DeepSetTraining, parts: list[FlightData], test: FlightData
     ) -> Path:
-        """Fit one network, unless its file is there, and write its record beside it."""
+        """Fit one network, unless its file is whole, and write its record beside it."""
         weights = _weights(self.folder, name)
         begun = perf_counter()
-        if not weights.exists():
+        if made_before(lambda: DeepSet.load(weights), self.say) is None:
             samples = join([self._samples(part) for part in parts])
             network = fit_deep_set(
                 samples,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from lagros_benchmarks.experiment import Progress
 from lagros_benchmarks.settings import BenchmarkSettings
@@ -13,6 +13,7 @@ from lagros_policies.imitation.shards import claim
 
 # Takes a line after each stage.
 Say = Callable[[str], None]
+Made = TypeVar("Made")
 
 
 class Reproduction(Protocol):
@@ -29,6 +30,22 @@ class Reproduction(Protocol):
 
     def benchmark(self, folder: Path | None) -> BenchmarkSettings:
         """Return the benchmark of what lies in the folder; None takes what is shipped."""
+
+
+def made_before(read: Callable[[], Made], say: Say) -> Made | None:
+    """Return what a stage has left behind; None if it is not there, or damaged, which is said.
+
+    Args:
+        read: Reads the stage's file.
+        say: Takes a line.
+    """
+    try:
+        return read()
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        say(f"{error}; it is made again")
+        return None
 
 
 def reproduce(

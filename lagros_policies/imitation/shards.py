@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
+import logging
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -18,9 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.files import write_atomic
+from lagros_envs.reading import read_json, read_npz
 from lagros_policies.backends import LOKY, Backend, each
 
 Shard = dict[str, NDArray[Any]]
+
+_LOG = logging.getLogger(__name__)
 
 
 def make_shards(
@@ -32,7 +35,7 @@ def make_shards(
     on_shard: Callable[[int], None] | None = None,
     backend: Backend = LOKY,
 ) -> list[Shard]:
-    """Make all shards, or those that an interrupted call left out.
+    """Make all shards, or those that an interrupted call left out or that are damaged.
 
     Args:
         folder: Where the shards are kept.
@@ -47,35 +50,29 @@ def make_shards(
         The shards in the order of their indices.
 
     Raises:
-        ValueError: The folder holds data of another record, or a shard is damaged.
+        ValueError: The folder holds data of another record.
         BackendError: The backend is not installed, not reachable, or loses its workers.
     """
     folder.mkdir(parents=True, exist_ok=True)
     claim(folder / "manifest.json", record, "expert data")
     paths = [folder / f"shard_{index:04d}.npz" for index in range(count)]
-    missing = [index for index, path in enumerate(paths) if not path.exists()]
-    done = count - len(missing)
+    shards: dict[int, Shard] = {}
+    for index, path in enumerate(paths):
+        try:
+            shards[index] = read_npz(path)
+        except FileNotFoundError:
+            continue
+        except ValueError as error:
+            _LOG.warning("%s; it is made again", error)
+    missing = [index for index in range(count) if index not in shards]
     if on_shard is not None:
-        on_shard(done)
+        on_shard(len(shards))
     for one, packed in each(partial(_packed, make), missing, jobs, backend):
-        write_atomic(paths[missing[one]], packed)
-        done += 1
+        path = write_atomic(paths[missing[one]], packed)
+        shards[missing[one]] = read_npz(path)
         if on_shard is not None:
-            on_shard(done)
-    return [read_shard(path) for path in paths]
-
-
-def read_shard(path: Path) -> Shard:
-    """Read a shard; nothing in it is executed.
-
-    Raises:
-        ValueError: The file is damaged.
-    """
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (zipfile.BadZipFile, EOFError, ValueError) as error:
-        raise ValueError(f"{path} is damaged ({error}); remove it, and it is made again") from error
+            on_shard(len(shards))
+    return [shards[index] for index in range(count)]
 
 
 def claim(path: Path, record: Mapping[str, Any], what: str) -> None:
@@ -87,12 +84,17 @@ def claim(path: Path, record: Mapping[str, Any], what: str) -> None:
         what: Name of the content, for the error.
 
     Raises:
-        ValueError: The folder belongs to another record.
+        ValueError: The folder belongs to another record, or its own cannot be read.
     """
     plain = json.loads(json.dumps(record))
     if not path.exists():
         write_atomic(path, json.dumps(plain, indent=1) + "\n")
-    elif json.loads(path.read_text()) != plain:
+        return
+    try:
+        found = read_json(path, "the record of a folder")
+    except ValueError as error:
+        raise ValueError(f"{error}; name another folder or remove {path.parent}") from error
+    if found != plain:
         raise ValueError(
             f"{path.parent} holds {what} of other settings; name another folder or remove it"
         )

@@ -28,6 +28,7 @@ FILES = (
     "cartpole_learned.safetensors",
     "cartpole_learned.json",
 )
+DAMAGED = (".json", ".npz", ".safetensors")
 
 
 class InterruptedRunError(Exception):
@@ -59,6 +60,21 @@ def test_an_interrupted_run_ends_with_the_files_of_one_that_was_not(tmp_path):
         reproduce(tmp_path / "broken", small(), progress=stop_in_training)
     assert not (tmp_path / "broken" / "cartpole_lagros.safetensors").exists()
     reproduce(tmp_path / "broken", small())
+    same, different, missing = filecmp.cmpfiles(
+        tmp_path / "whole", tmp_path / "broken", FILES, shallow=False
+    )
+    assert (sorted(same), different, missing) == (sorted(FILES), [], [])
+
+    # A stage counts only if its files are whole.
+    damaged = [path for path in (tmp_path / "broken").rglob("*") if path.suffix in DAMAGED]
+    damaged = [path for path in damaged if path.stem not in ("settings", "manifest")]
+    damaged = [path for path in damaged if "checkpoint" not in path.stem]
+    assert len(damaged) == len(FILES) + 2
+    for path in damaged:
+        path.write_bytes(path.read_bytes()[:-20])
+    said = []
+    reproduce(tmp_path / "broken", small(), say=said.append)
+    assert sum("it is made again" in line for line in said) == 3
     same, different, missing = filecmp.cmpfiles(
         tmp_path / "whole", tmp_path / "broken", FILES, shallow=False
     )

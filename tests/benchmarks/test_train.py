@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import signal
@@ -246,6 +247,30 @@ def test_a_run_that_was_killed_ends_with_the_same_weights(name, correction, tmp_
     # A complete run is read and not run again.
     again = train(training, Place(folder), lambda: pytest.fail("it was complete"))
     assert again["final"] == whole["final"]
+
+
+@pytest.mark.parametrize("how", ["gone", "empty", "truncated", "of another run", "a folder"])
+def test_a_run_without_its_weights_is_made_again(tmp_path, how):
+    training = replace(TINY, segments=1)
+    whole = run(training, tmp_path / "run")
+    weights = tmp_path / "run" / "weights.safetensors"
+    content = weights.read_bytes()
+    assert hashlib.sha256(content).hexdigest() == whole["weights_sha256"]
+    weights.unlink()
+    if how == "of another run":
+        run(replace(training, seed=1), tmp_path / "other")
+        weights.write_bytes((tmp_path / "other" / "weights.safetensors").read_bytes())
+    elif how == "a folder":
+        weights.mkdir()
+        with pytest.raises(OSError, match="folder"):
+            run(training, tmp_path / "run")
+        weights.rmdir()
+    elif how != "gone":
+        weights.write_bytes(content[: {"empty": 0, "truncated": -10}[how]])
+    again = run(training, tmp_path / "run")
+    assert again["final"] == whole["final"]
+    assert weights.read_bytes() == content
+    train(training, Place(tmp_path / "run"), lambda: pytest.fail("it was complete"))
 
 
 def test_the_folder_of_another_run_is_refused(tmp_path, monkeypatch):

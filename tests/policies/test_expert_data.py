@@ -267,15 +267,24 @@ def test_folder_of_other_settings_is_refused_and_left_alone(metric, data, folder
     assert same(generate(folder, metric, SETTINGS), data)
 
 
-def test_damaged_shard_is_named(metric, tmp_path):
+@pytest.mark.parametrize("cut", [100, -100, 0])
+def test_damaged_shard_is_named_and_made_again(metric, tmp_path, cut, caplog):
     few = ExpertDataSettings(plans=2, samples=4, shards=2)
-    generate(tmp_path, metric, few)
+    whole = generate(tmp_path, metric, few)
     victim = shards(tmp_path)[1]
     content = victim.read_bytes()
-    for damaged in (content[:100], content[:-100], b"", b"x" * 500):
-        victim.write_bytes(damaged)
-        with pytest.raises(ValueError, match=victim.name):
-            generate(tmp_path, metric, few)
+    victim.write_bytes(content[:cut] or b"x" * 500)
+    assert same(generate(tmp_path, metric, few), whole)
+    assert victim.read_bytes() == content
+    assert victim.name in caplog.text
+
+
+@pytest.mark.parametrize("text", ["", "{", "\xff", "[" * 100_000])
+def test_damaged_manifest_is_named(metric, tmp_path, text):
+    few = ExpertDataSettings(plans=2, samples=4, shards=2)
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(ValueError, match=r"manifest.json .*; name another folder or remove"):
+        generate(tmp_path, metric, few)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ with the same versions, ends with the same weights to the last bit.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import logging
@@ -30,6 +31,7 @@ from lagros_benchmarks.surroundings import machine, versions
 from lagros_benchmarks.training.agent import make_agent
 from lagros_benchmarks.training.curves import AXES
 from lagros_benchmarks.training.settings import Training
+from lagros_policies.imitation.networks import read_safetensors
 
 _LOG = logging.getLogger(__name__)
 WEIGHTS, RECORD, CHECKPOINT = "weights.safetensors", "record.json", "checkpoint.pt"
@@ -95,6 +97,8 @@ def train(
 ) -> dict[str, Any]:
     """Train, or go on with a run that was interrupted; a complete run is only read.
 
+    A run is complete if its weights are there as they were written; else it is made again.
+
     Args:
         training: The run.
         place: Where it is kept.
@@ -110,7 +114,9 @@ def train(
     """
     settings = plain(training.record())
     if place.record.exists():
-        return _complete(place, settings)
+        complete = _complete(place, settings)
+        if complete is not None:
+            return complete
     made = lesson()
     model = make_agent(training, made.venv)
     curve = _restore(place.checkpoint, settings, model) if place.checkpoint.exists() else []
@@ -132,20 +138,34 @@ def train(
     model.logger.close()
     made.save(model, place.weights)
     record = plain(_record(settings, curve, made.final(model), command))
+    record["weights_sha256"] = _digest(place.weights)
     write_json(place.record, record)
     place.checkpoint.unlink(missing_ok=True)
     finished: dict[str, Any] = record
     return finished
 
 
-def _complete(place: Place, settings: Any) -> dict[str, Any]:
+def _complete(place: Place, settings: Any) -> dict[str, Any] | None:
+    """Return the record of a run whose weights are whole, None if they are not."""
     try:
         record: dict[str, Any] = json.loads(place.record.read_text())
         stored = record["training"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{place.record} is damaged ({error}); delete {place.folder}") from error
     _check_same(place.folder, stored, settings)
+    try:
+        read_safetensors(place.weights)
+        # Records of earlier versions have no hash; the file itself has a checksum.
+        if record.get("weights_sha256") not in (None, _digest(place.weights)):
+            raise ValueError(f"{place.weights} is not what this run has written")
+    except (ValueError, OSError) as error:
+        _LOG.warning("%s; the run is made again", error)
+        return None
     return record
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _check_same(folder: Path, stored: Any, settings: Any) -> None:
