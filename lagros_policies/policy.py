@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_policies.naming import UserClass, model_file, user_class
 from lagros_policies.wrappers import bare_environment
 
 Float32Array = NDArray[np.float32]
@@ -135,6 +136,7 @@ def make(
     else:
         classes = _CARTPOLE
     if name in classes:
+<<<<<<< HEAD
         return _shipped(name, classes[name], world, allow_other_settings, settings)
     if name.endswith(".zip"):
         from lagros_policies.sb3_model import load_stable_baselines3
@@ -143,6 +145,17 @@ def make(
         return load_stable_baselines3(path, algorithm or None, **settings)
     if ":" in name:
         return _built(_class_named(name), world, allow_other_settings, settings)
+=======
+        return _shipped(name, classes[name], task, world, settings)
+    model = model_file(name)
+    if model is not None:
+        from lagros_policies.sb3_model import load_stable_baselines3
+
+        return load_stable_baselines3(model.path, model.algorithm, **settings)
+    own = user_class(name)
+    if own is not None:
+        return _built(_class_named(name, own), task, world, settings)
+>>>>>>> 93c0dfb (Search the working folder last and only for a class named there; end workers with their parent)
     near = difflib.get_close_matches(name, classes, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     raise ValueError(
@@ -178,12 +191,16 @@ def _shipped(
         ) from error
 
 
-def _class_named(name: str) -> Callable[..., Policy]:
-    module, _, attribute = name.partition(":")
+def _class_named(name: str, own: UserClass) -> Callable[..., Policy]:
     try:
-        return cast("Callable[..., Policy]", getattr(importlib.import_module(module), attribute))
-    except (ImportError, AttributeError) as error:
+        module = importlib.import_module(own.module)
+    except ImportError as error:
         raise ValueError(
             f"policy {name!r}: {error}; module:Class must name a class that Python can import from "
             "here"
         ) from error
+    found = getattr(module, own.attribute, None)
+    if not callable(found):
+        place = getattr(module, "__file__", None) or "built into Python"
+        raise ValueError(f"policy {name!r}: {own.module} ({place}) has no class {own.attribute!r}")
+    return cast("Callable[..., Policy]", found)

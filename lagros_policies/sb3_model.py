@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from lagros_envs import cartpole_task, spacecraft_task
 from lagros_envs.observation import Layout
 from lagros_envs.scenarios import Preset, preset_named
+from lagros_policies.naming import ALGORITHMS
 
 Float32Array = NDArray[np.float32]
-
-ALGORITHMS = ("A2C", "DDPG", "PPO", "SAC", "TD3")
 
 
 class StableBaselines3Policy:

@@ -83,10 +83,10 @@ def attack(
     """
     from lagros_benchmarks.library import SetupError
 
-    find_users_modules()
+    find_users_modules([policy])
     try:
         if replay is not None:
-            _replay(task, replay)
+            _replay(task, policy, replay)
             return
         settings = _settings(task, policy, goal, bound, episodes, budget, seed, method)
         if safety_filter:
@@ -158,13 +158,20 @@ def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> No
         raise typer.Exit(RAISED)
 
 
-def _replay(task: str, path: Path) -> None:
+def _replay(task: str, policy: str, path: Path) -> None:
     from lagros_benchmarks.worst_case.attack import fly_again
     from lagros_benchmarks.worst_case.replay import load_worst_cases
+    from lagros_policies.naming import is_code
 
     cases = load_worst_cases(path)
     if cases.command.get("task") != task:
         raise ValueError(f"{path} is of the task {cases.command.get('task')!r}, not {task!r}")
+    flown = str(cases.command.get("policy"))
+    if is_code(flown) and flown != policy:
+        raise ValueError(
+            f"{path} was found against {flown!r}, which is code of somebody's: name it, too, with "
+            f"--policy {flown}, if you trust it"
+        )
     differing = 0
     for before, now in zip(cases.outcomes, fly_again(cases), strict=True):
         same = before == now

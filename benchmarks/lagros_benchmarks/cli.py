@@ -166,16 +166,18 @@ def bench(
     from lagros_benchmarks.report import Outputs
     from lagros_benchmarks.settings import BenchmarkSettings, check_policy, check_task
     from lagros_policies.backends import Backend
+    from lagros_policies.naming import listed_names
 
     outputs = Outputs(json, csv, latex, markdown, figure, episodes_file, scene, scene_world)
-    find_users_modules()
+    named = None if policies is None else listed_names(policies)
+    find_users_modules(named or ())
     try:
         check_task(task)
         if replan_every is not None and task != "cartpole":
             raise ValueError(f"--replan-every is for cartpole; leave it out for {task}")
         settings = BenchmarkSettings.for_task(
             task,
-            policies=listed_or_none(policies, str, "--policies"),
+            policies=named,
             policy_settings=None
             if replan_every is None
             else {"tube-mpc": {"replan_every": replan_every}},

@@ -65,8 +65,10 @@ def check_outputs(
 
 def policy_files(policies: Iterable[str]) -> dict[str, Path]:
     """Return the policies that are files, which may be written algorithm:file, as inputs."""
-    paths = (Path(name.rpartition(":")[2]) for name in policies)
-    return {f"the policy {path}": path for path in paths if path.suffix == ".zip"}
+    from lagros_policies.naming import model_file
+
+    models = filter(None, map(model_file, policies))
+    return {f"the policy {model.path}": model.path for model in models}
 
 
 def _writable(option: str, path: Path, named: Path) -> Writable:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from lagros_envs.checks import (
@@ -92,22 +90,22 @@ def check_policy(name: str, task: str = "cartpole") -> None:
     Raises:
         ValueError: It is neither.
     """
+    from lagros_policies.naming import is_file, is_importable, model_file, user_class
     from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
 
     names = NAMES if task == "cartpole" else SPACECRAFT_NAMES
     if name in names:
         return
-    # A file may be written algorithm:file, as in sac:model.zip.
-    path = Path(name.rpartition(":")[2])
-    if path.suffix == ".zip":
-        if path.is_file():
+    model = model_file(name)
+    if model is not None:
+        if is_file(model.path):
             return
-        raise ValueError(f"there is no file {str(path)!r} for a policy")
-    module, colon, _ = name.partition(":")
-    if colon:
-        if importlib.util.find_spec(module) is None:
-            raise ValueError(f"there is no module {module!r} for the policy {name!r}")
-        return
+        raise ValueError(f"there is no file {str(model.path)!r} for a policy")
+    own = user_class(name)
+    if own is not None:
+        if is_importable(own.module):
+            return
+        raise ValueError(f"there is no module {own.module!r} for the policy {name!r}")
     raise ValueError(
         unknown_name(
             "policy", name, names, ", the .zip of a stable-baselines3 model, or module:Class"

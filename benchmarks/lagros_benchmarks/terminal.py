@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -60,9 +60,15 @@ class Commands(TyperGroup):
             fail(error, status=1)
 
 
-def find_users_modules() -> None:
-    """Let a policy of the user's own, module:Class, lie in the folder that lagros is run from."""
-    sys.path.insert(0, os.getcwd())
+def find_users_modules(policies: Iterable[str]) -> None:
+    """Let a policy of the user's own, module:Class, lie in the folder that lagros is run from.
+
+    The folder comes last: no file in it can take the place of a package that is installed. It is
+    not searched at all where no policy is named so.
+    """
+    here = os.getcwd()
+    if any(":" in name for name in policies) and here not in sys.path:
+        sys.path.append(here)
 
 
 def listed(text: str, convert: Callable[[str], Value], option: str) -> tuple[Value, ...]:

@@ -73,7 +73,7 @@ def watch(
     from lagros_benchmarks.playback import Playback, WatchSettings
     from lagros_envs.files import write_atomic
 
-    find_users_modules()
+    find_users_modules([policy])
     try:
         settings = WatchSettings(
             task=task,

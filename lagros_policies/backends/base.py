@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -18,6 +21,8 @@ BACKENDS = ("loky", "ray", "dask")
 ATTEMPTS = 4
 # How long a cluster may take to answer the first time [s].
 PATIENCE = 10.0
+# What keeps Python from searching the folder that it is started in.
+SAFE_PATH = "PYTHONSAFEPATH"
 
 _LOG = logging.getLogger(__name__)
 
@@ -59,6 +64,38 @@ class Backend:
 
 
 LOKY = Backend()
+
+
+@contextmanager
+def without_folder() -> Iterator[None]:
+    """Let the interpreters that are started here not look for modules in the folder we are in.
+
+    They would do so first, before the search path of this process reaches them: a file there that
+    is called as one of Python's own modules would run in its place.
+    """
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before
+
+
+def sheltered(work: Callable[[Item], Outcome], item: Item) -> Outcome:
+    """Do the work in a worker, where an exit that it asks for must not end the process.
+
+    Raises:
+        RuntimeError: The work asked to end the process, or was ended in another odd way.
+    """
+    try:
+        return work(item)
+    except (Exception, KeyboardInterrupt):
+        raise
+    except BaseException as error:  # SystemExit(0) would end the whole run with status 0
+        raise RuntimeError(f"{type(error).__name__}: {error}") from error
 
 
 def say_lost(chunks: int) -> None:

@@ -20,8 +20,19 @@ from typing import Any
 
 from joblib.externals.loky.backend.reduction import dumps, loads
 
-from lagros_policies.backends.base import BackendError, Item, Outcome, gave_up, installed, knock
+from lagros_policies.backends.base import (
+    BackendError,
+    Item,
+    Outcome,
+    gave_up,
+    installed,
+    knock,
+    sheltered,
+    without_folder,
+)
 
+# Where a cluster that is started here listens: no other machine reaches it.
+LOOPBACK = "127.0.0.1"
 # How often a process looks whether its last result was taken [s].
 _LOOK = 0.002
 # A worker of Dask may have threads; the chunks share its process and run one at a time.
@@ -105,7 +116,7 @@ def _chunk(work: Callable[[Item], Outcome], index: int, item: Item, topic: str) 
         # The scheduler knows of the start before the work, which may kill this process, begins.
         sync(worker.loop, worker.scheduler.log_event, topic=topic, msg=index)
         # The client reads it in the caller's thread, where an error has somewhere to go.
-        packed = bytes(dumps(work(item)))
+        packed = bytes(dumps(sheltered(work, item)))
         _LAST[topic] = _key(topic, index)
         return packed
 
@@ -131,21 +142,7 @@ def connected(address: str | None, jobs: int) -> Iterator[Any]:
         yield client
         return
     with ExitStack() as stack:
-        if address is None:
-            # A dead worker is started again at once. LocalCluster gives up one that is dead again
-            # so long after a death, by default after 15 s, until none is left.
-            lost = {"distributed.deploy.lost-worker-timeout": "7 days"}
-            stack.enter_context(installed("dask").config.set(lost))
-            place = stack.enter_context(
-                distributed.LocalCluster(
-                    n_workers=jobs,
-                    threads_per_worker=1,
-                    dashboard_address=":0",  # any free port, and no warning where 8787 is taken
-                    silence_logs=logging.CRITICAL,
-                )
-            )
-        else:
-            place = address
+        place = _started(stack, distributed, jobs) if address is None else address
         try:
             if address is not None:
                 _knock(address)
@@ -157,6 +154,30 @@ def connected(address: str | None, jobs: int) -> Iterator[Any]:
                 "address out to start workers on this machine"
             ) from error
         yield client
+
+
+def _started(stack: ExitStack, distributed: Any, jobs: int) -> Any:
+    """Start a cluster on this machine that no other can reach, until the stack is closed.
+
+    Raises:
+        BackendError: It does not start.
+    """
+    # A dead worker is started again at once. LocalCluster gives up one that is dead again so long
+    # after a death, by default after 15 s, until none is left.
+    lost = {"distributed.deploy.lost-worker-timeout": "7 days"}
+    stack.enter_context(installed("dask").config.set(lost))
+    stack.enter_context(without_folder())
+    try:
+        cluster = distributed.LocalCluster(
+            n_workers=jobs,
+            threads_per_worker=1,
+            host=LOOPBACK,
+            dashboard_address=f"{LOOPBACK}:0",  # any free port, and no warning if 8787 is taken
+            silence_logs=logging.CRITICAL,
+        )
+    except Exception as error:  # Dask wraps what happened in errors of its own
+        raise BackendError(f"Dask does not start ({error}); try --backend loky") from error
+    return stack.enter_context(cluster)
 
 
 def _knock(address: str) -> None:

@@ -6,8 +6,8 @@ the processes, which share nothing with this one, and its pickles carry function
 process that dies closes its pipe, even in the middle of an answer; another one is started and runs
 its chunk again. What was handed over whole is kept.
 
-Processes are kept for later calls, and end when nobody has asked them for five minutes, when this
-process ends, and, if it is killed, with the chunk that they are running.
+Processes are kept for later calls, and end when nobody has asked them for five minutes and when
+this process ends, at once if it is killed.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import atexit
 import faulthandler
 import os
 import signal
+import threading
 import time
 import traceback
 from collections import deque
@@ -30,7 +31,15 @@ from joblib.externals.loky.backend import get_context
 from joblib.externals.loky.backend.reduction import dumps, loads
 from joblib.externals.loky.backend.utils import kill_process_tree
 
-from lagros_policies.backends.base import ATTEMPTS, Item, Outcome, gave_up
+from lagros_policies.backends.base import (
+    ATTEMPTS,
+    SAFE_PATH,
+    Item,
+    Outcome,
+    gave_up,
+    sheltered,
+    without_folder,
+)
 
 # How long a worker waits to be asked again [s]; as in joblib.
 PATIENCE = 300.0
@@ -60,12 +69,16 @@ class _Worker:
         self.environment = environment
         self.idle_since = time.monotonic()
         self.connection, theirs = Pipe()
+        # Nothing is ever sent on it: it breaks when this process dies, whatever kills it.
+        there, self._alive = Pipe(duplex=False)
         self._process = get_context("loky").Process(
-            target=_serve, args=(theirs,), env=dict(environment)
+            target=_serve, args=(theirs, there), env=dict(environment)
         )
-        self._process.start()
+        with without_folder():
+            self._process.start()
         # Theirs only: the pipe must break when the process dies.
         theirs.close()
+        there.close()
         self._work: bytes | None = None
         _ALL.add(self)
 
@@ -93,6 +106,7 @@ class _Worker:
         """Let the process end by itself, which it does when it waits and its pipe is closed."""
         _ALL.discard(self)
         self.connection.close()
+        self._alive.close()
 
     def end(self) -> None:
         """End the process, whatever it is doing, and those that it started."""
@@ -189,8 +203,20 @@ def _hire(environment: Mapping[str, str]) -> _Worker:
     return _Worker(environment)
 
 
-def _serve(connection: Connection) -> None:
+def _watch(alive: Connection) -> None:
+    """End this process, a worker, with the one that started it, even amid a chunk."""
+    with suppress(EOFError, OSError):
+        alive.recv_bytes()
+    os._exit(1)
+
+
+def _serve(connection: Connection, alive: Connection) -> None:
     """Answer one item after the other, in a worker, until nobody asks."""
+    threading.Thread(target=_watch, args=(alive,), daemon=True).start()
+    os.environ.pop(SAFE_PATH, None)
+    # The output of this command is its own; what the work prints is not part of it.
+    with suppress(OSError):
+        os.dup2(2, 1)
     # The terminal's Ctrl-C goes to every process: what becomes of us, the one that asked decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable()
@@ -202,7 +228,7 @@ def _serve(connection: Connection) -> None:
                 new, item = loads(message)
                 work = new or work
                 # A copy for every chunk: nothing that one leaves behind is there for the next.
-                answer = dumps((True, loads(work)(item)))
+                answer = dumps((True, sheltered(loads(work), item)))
             except BaseException as error:  # whatever it is belongs to the one that asked
                 answer = _refusal(error)
             connection.send_bytes(answer)

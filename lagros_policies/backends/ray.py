@@ -4,6 +4,9 @@ A result lies outside the process that made it as soon as the task is done, so t
 that dies takes nothing with it but what it was running. A whole machine of the cluster that goes
 takes more: what its processes were running, and those of their results over 100 KiB that nobody had
 fetched yet.
+
+Also where it is started on this machine alone, Ray's processes listen on every network that the
+machine is on, and execute what they are sent: behind no firewall take loky or Dask.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from lagros_policies.backends.base import (
     gave_up,
     installed,
     knock,
+    sheltered,
 )
 
 
@@ -74,7 +78,7 @@ def run(
 
 
 def _call(work: Callable[[Item], Outcome], item: Item) -> Outcome:
-    return work(item)
+    return sheltered(work, item)
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -112,6 +113,23 @@ class AwkwardError(Exception):
 
 def be_awkward(number):
     raise AwkwardError(number, "odd")
+
+
+def leave(number):
+    raise SystemExit(0)
+
+
+def close(number):
+    raise GeneratorExit
+
+
+def say(number):
+    sys.stdout.write("said\n")
+    sys.stdout.flush()
+
+
+def safe_path(number):
+    return os.environ.get("PYTHONSAFEPATH")
 
 
 def process(number):

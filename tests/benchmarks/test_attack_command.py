@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -115,3 +116,20 @@ def test_attack_says_what_is_wrong(options: list[str], message: str) -> None:
     assert done.exit_code == 2
     assert message in done.output
     assert "Traceback" not in done.output
+
+
+def test_a_file_names_no_code_that_is_not_named_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fit = POLICIES.replace("np.float32([observation[..., 1]])", "observation[..., 1:2]")
+    (tmp_path / "mine_of_a_file.py").write_text(fit)
+    options = ["--episodes", "1", "--budget", "4", "--npz", "x.npz"]
+    done = RUNNER.invoke(app, ["attack", "cartpole", "--policy", "mine_of_a_file:Single", *options])
+    assert done.exit_code == 0, done.output
+    # Whoever is given the file does not run what it names.
+    sys.modules.pop("mine_of_a_file")
+    (tmp_path / "mine_of_a_file.py").write_text("raise SystemError('ran')")
+    refused = RUNNER.invoke(app, ["attack", "cartpole", "--replay", "x.npz"])
+    assert refused.exit_code == 2
+    assert "--policy mine_of_a_file:Single, if you trust it" in refused.output

@@ -248,14 +248,13 @@ def test_who_stops_asking_leaves_no_chunk_running(how, tmp_path):
     assert idle <= set(dict(each(fragile.process, range(9), 3)).values())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kill", [signal.SIGINT, signal.SIGKILL])
 def test_workers_end_with_the_one_that_asked(kill, tmp_path):
     script = f"""
 import pathlib
 from lagros_policies.backends import each
 from tests.benchmarks.fragile import Fragile
-work = Fragile(pathlib.Path({str(tmp_path)!r}), lasting={600.0 if kill == signal.SIGINT else 1.0})
+work = Fragile(pathlib.Path({str(tmp_path)!r}), lasting=600.0)
 list(each(work, range(100), 2))
 """
     run = subprocess.Popen(
@@ -273,6 +272,44 @@ list(each(work, range(100), 2))
     assert run.returncode != 0
     assert trouble.count("Traceback") == (kill == signal.SIGINT)
     wait_until(lambda: all(is_gone(process) for _, process in log()))
+
+
+@pytest.mark.parametrize("work", [fragile.leave, fragile.close])
+def test_work_that_asks_to_exit_ends_neither_its_worker_nor_the_run(work):
+    with pytest.raises(RuntimeError, match=r"SystemExit: 0|GeneratorExit"):
+        list(each(work, [1], 2))
+    assert dict(each(fragile.process, [1, 2], 2))
+
+
+def test_what_work_prints_is_no_output_of_the_run(capfd, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "5")  # so that no idle worker is fit
+    list(each(fragile.say, [1, 2], 2))
+    out, trouble = capfd.readouterr()
+    assert (out, trouble.count("said")) == ("", 2)
+
+
+def test_workers_search_no_module_in_the_folder_that_they_are_started_in(tmp_path, monkeypatch):
+    for name in ("numpy", "joblib", "signal", "fragile_only"):
+        (tmp_path / f"{name}.py").write_text("raise SystemError('taken from the folder')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")  # so that no idle worker is fit
+    assert set(dict(each(fragile.safe_path, [1, 2], 2)).values()) == {None}
+    assert "PYTHONSAFEPATH" not in os.environ
+
+
+@pytest.mark.slow
+def test_a_cluster_that_dask_starts_here_listens_to_this_machine_alone():
+    pytest.importorskip("distributed", reason="the extra `dask` is not installed")
+    psutil = pytest.importorskip("psutil")
+    with running(DASK, 1):
+        us = psutil.Process()
+        ends = [
+            connection.laddr.ip
+            for process in (us, *us.children(recursive=True))
+            for connection in process.net_connections("inet")
+            if connection.status == psutil.CONN_LISTEN
+        ]
+    assert set(ends) == {"127.0.0.1"}
 
 
 def test_a_worker_of_this_machine_that_dies_in_the_middle_of_its_answer(tmp_path):

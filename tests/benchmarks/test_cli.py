@@ -147,3 +147,27 @@ def test_help_imports_nothing_heavy():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout
     assert output.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("bench", "cartpole", "--policies"),
+        ("watch", "cartpole", "--policy"),
+        ("attack", "cartpole", "--policy"),
+    ],
+)
+def test_the_folder_is_searched_last_and_for_classes_alone(invoke, tmp_path, monkeypatch, command):
+    before = [place for place in sys.path if place != str(tmp_path)]
+    monkeypatch.setattr(sys, "path", list(before))
+    assert invoke(*command, "nobody").exit_code == 2
+    assert sys.path == before
+    for name in ("json", "mine_of_the_folder"):
+        (tmp_path / f"{name}.py").write_text("raise ArithmeticError('of the folder')")
+    result = invoke(*command, "json:Good")  # Python's own, in spite of the file
+    assert result.exit_code in (1, 2)
+    assert "has no class 'Good'" in result.stderr
+    result = invoke(*command, "mine_of_the_folder:Good")
+    assert result.exit_code == 1
+    assert "ArithmeticError: of the folder" in result.stderr
+    assert sys.path == [*before, str(tmp_path)]
