@@ -17,7 +17,13 @@ from lagros_policies.planning.joint_plan import JointPlan
 from lagros_policies.planning.spacecraft import SpacecraftPlanner, SpacecraftPlannerSettings
 from lagros_policies.policy import PolicyState, row_memories
 from lagros_policies.sensed import WorldState
-from lagros_policies.spacecraft_setup import PAIR_SHARE, PLANE, task_and_preset
+from lagros_policies.spacecraft_setup import (
+    PAIR_SHARE,
+    PLANE,
+    check_planner_force,
+    plan_force_limit,
+    task_and_preset,
+)
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -32,16 +38,20 @@ _SHARES = (1.0, 0.75, 0.5, 0.25)
 _MARGIN_GROWTH = 0.05
 
 
-def planner_settings(settings: task.SpacecraftSettings, margin: float) -> SpacecraftPlannerSettings:
+def planner_settings(
+    settings: task.SpacecraftSettings, margin: float, disturbance_bound: float = 0.0
+) -> SpacecraftPlannerSettings:
     """Return how to plan the task with a margin, less of it where there is no such plan.
 
     Args:
         settings: The task.
         margin: Room beyond touching to ask for first [m].
+        disturbance_bound: d_bar for which plans leave force where there is a thrust limit, in units
+            of the state per second.
 
     Raises:
-        ValueError: The horizon is not a whole number of node steps of 0.5 s, or one of those is not
-            a whole number of control periods.
+        ValueError: The horizon is not a whole number of node steps of 0.5 s, one of those is not a
+            whole number of control periods, or the thrust limit leaves no force for plans.
     """
     nodes = round(settings.horizon / _NODE_PERIOD)
     if abs(nodes * _NODE_PERIOD - settings.horizon) > 1e-6:
@@ -57,6 +67,7 @@ def planner_settings(settings: task.SpacecraftSettings, margin: float) -> Spacec
         margins=tuple(share * margin for share in _SHARES),
         pair_share=PAIR_SHARE,
         margin_growth=_MARGIN_GROWTH,
+        force_limit=plan_force_limit(settings, disturbance_bound),
     )
 
 
@@ -109,8 +120,8 @@ class CentralizedPolicy:
         planner: The planner, with margins of its own.
 
     Raises:
-        ValueError: A value is out of range, `margin` and `planner` are both given, or the planner's
-            periods or mass are not those of the task.
+        ValueError: A value is out of range, `margin` and `planner` are both given, the planner's
+            periods or mass are not those of the task, or the thrust limit leaves it less force.
     """
 
     name = "centralized"
@@ -138,12 +149,13 @@ class CentralizedPolicy:
         self.tracking = WrenchTracking.for_rates(body, period, contraction_rate, turning_rate)
         wanted = planned_margin(margin, disturbance_bound, contraction_rate)
         if planner is None:
-            planner = planner_settings(self.settings, wanted)
+            planner = planner_settings(self.settings, wanted, disturbance_bound)
         elif planner.control_period != period or planner.mass != body.mass:
             raise ValueError(
                 f"the planner is for control_period={planner.control_period!r} and "
                 f"mass={planner.mass!r}; the task has {period!r} and {body.mass!r}"
             )
+        check_planner_force(planner.force_limit, plan_force_limit(self.settings, disturbance_bound))
         self.planner = SpacecraftPlanner(planner)
 
     def predict(

@@ -21,7 +21,13 @@ from lagros_policies.planning.local_plan import LocalPlanner
 from lagros_policies.planning.local_problem import LocalPlannerSettings
 from lagros_policies.policy import PolicyState, row_memories
 from lagros_policies.sensed import Sensed
-from lagros_policies.spacecraft_setup import PAIR_SHARE, PLANE, task_and_preset
+from lagros_policies.spacecraft_setup import (
+    PAIR_SHARE,
+    PLANE,
+    check_planner_force,
+    plan_force_limit,
+    task_and_preset,
+)
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -106,7 +112,7 @@ class DistributedTubeMpcPolicy:
         planner: The planner; its mass must be that of the task.
 
     Raises:
-        ValueError: A value is out of range.
+        ValueError: A value is out of range, or the thrust limit leaves plans no force.
     """
 
     name = "tube-mpc"
@@ -138,11 +144,13 @@ class DistributedTubeMpcPolicy:
         self.margin = planned_margin(margin, disturbance_bound, contraction_rate)
         self.replan_every, self.kept_for, self.smoothing = replan_every, kept_for, smoothing
         self.still = _STILL + _STILL_NOISE * disturbance_bound
-        planner = planner or LocalPlannerSettings(mass=body.mass)
+        allowed = plan_force_limit(self.settings, disturbance_bound)
+        planner = planner or LocalPlannerSettings(mass=body.mass, force_limit=allowed)
         if planner.mass != body.mass:
             raise ValueError(
                 f"the planner is for mass={planner.mass!r}; the task has {body.mass!r}"
             )
+        check_planner_force(planner.force_limit, allowed)
         self.planner = LocalPlanner(planner)
 
     def predict(

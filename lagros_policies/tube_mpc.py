@@ -135,7 +135,12 @@ class TubeMpcPolicy:
             return np.zeros(1)
         state = row[None, task.STATE]
         force = self.expert.control(memory.tracked, np.zeros(1, int), np.full(1, step), state)
-        return force.reshape(1)
+        return self._applied(force.reshape(1))
+
+    def _applied(self, force: FloatArray) -> FloatArray:
+        """Return what the task's limit leaves of a force (1,) [N]."""
+        limit = self.settings.force_limit
+        return force if limit is None else np.clip(force, -limit, limit)
 
     def _renew(self, row: FloatArray, goal: FloatArray, step: int, memory: TubeMpcState) -> None:
         plan = memory.plan

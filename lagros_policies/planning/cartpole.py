@@ -30,18 +30,14 @@ class CartPolePlannerSettings:
     Attributes:
         angle_margin: Steady margin of the angle [rad].
         margin_rate: Rate at which the margin grows from zero [1/s].
-        force_share: Where the task has a force limit, the share of it that plans use; the rest is
-            for u*.
         scp: How to iterate.
 
     Raises:
-        ValueError: The margin leaves no admissible angle, the rate is not positive, or the share is
-            not in (0, 1].
+        ValueError: The margin leaves no admissible angle, or the rate is not positive.
     """
 
     angle_margin: float = 0.4
     margin_rate: float = 0.6
-    force_share: float = 1.0
     scp: ScpSettings = field(default_factory=ScpSettings)
 
     def __post_init__(self) -> None:
@@ -50,8 +46,6 @@ class CartPolePlannerSettings:
         if not 0.0 <= self.angle_margin < FALL_ANGLE:
             raise ValueError(f"angle_margin={self.angle_margin!r} must be in [0, pi/2)")
         check_positive("margin_rate", self.margin_rate)
-        if not 0.0 < self.force_share <= 1.0:
-            raise ValueError(f"force_share={self.force_share!r} must be in (0, 1]")
 
 
 class CartPolePlanner:
@@ -73,7 +67,7 @@ class CartPolePlanner:
         problem = self.task.system, self.task.control_period, self.settings.scp
         self._solver = ScpSolver(*problem)
         limit = self.task.force_limit
-        self._largest = math.inf if limit is None else self.settings.force_share * limit
+        self._largest = math.inf if limit is None else limit
         self._limited = ScpSolver(*problem, self._largest)
 
     def angle_limit(self, time: FloatArray) -> FloatArray:

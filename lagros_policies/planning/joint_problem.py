@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -68,6 +69,7 @@ class JointProblem:
             force, shape (n,); the last node if left out.
         start_cost: If given, a plan may begin beside `starts`: each axis' deviation e = (position,
             velocity) costs e'Qe / 2 with this positive definite Q, shape (2, 2).
+        force_limit: Largest force per axis [N]; inf for none.
     """
 
     starts: FloatArray
@@ -81,6 +83,7 @@ class JointProblem:
     speed_limit: FloatArray
     arrivals: IntArray | None = None
     start_cost: FloatArray | None = None
+    force_limit: float = math.inf
 
     @property
     def nodes(self) -> int:

@@ -129,6 +129,8 @@ class ProgramLayout:
         linear[self.size : self.size + count] = settings.penalty
         low, high = np.full(size, -UNBOUNDED), np.full(size, UNBOUNDED)
         low[self.size :] = 0.0
+        largest = min(problem.force_limit, UNBOUNDED)
+        low[self.forces], high[self.forces] = -largest, largest
         low[self.idle] = high[self.idle] = 0.0
         speeds = self.states[1:-1, :, 2:]
         low[speeds], high[speeds] = -problem.speed_limit, problem.speed_limit

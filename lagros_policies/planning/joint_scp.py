@@ -2,6 +2,7 @@
 
     min  1/2 sum_i int ||F_i||^2 dt
     s.t. dp_i/dt = v_i, dv_i/dt = F_i / m, F_i held over a node step, given ends, |v_i| <= v_max,
+         |F_i| <= F_max per axis where there is a limit,
          ||p_i(t) - o_j|| >= R_ij(t) and ||p_i(t) - p_j(t)|| >= R_ij(t)
 
 The dynamics are linear, so that only the distances are linearised: along the unit vector e from

@@ -2,7 +2,8 @@
 
     min  1/2 int ||F||^2 dt + sum_k phi(s_k)
     s.t. dp/dt = v, dv/dt = F / m, F held over each step, from the given state to rest at the goal,
-         |v| <= v_max, ||p(t_k) - c_j(t_k)|| >= R_j(t_k) - s_k, s_k >= 0
+         |v| <= v_max, |F| <= F_max per axis where there is a limit,
+         ||p(t_k) - c_j(t_k)|| >= R_j(t_k) - s_k, s_k >= 0
 
 c_j is an obstacle, or another agent extrapolated at constant velocity. The plan always reaches to
 the goal, with short steps as far as others can be foreseen and long ones after that, so that its

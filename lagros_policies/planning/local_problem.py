@@ -27,6 +27,9 @@ BoolArray = NDArray[np.bool_]
 _UNBOUNDED = 1e30
 # Instants where distances are imposed: at most this far apart, near and far ahead [s].
 _NEAR_INSTANTS, _FAR_INSTANTS = 0.25, 0.5
+# A plan with a force limit is so long that this share of it would do without obstacles, found in
+# steps of this factor.
+_DIRECT_SHARE, _LONGER = 0.7, 1.1
 # An agent that lets others go first waits for this share of the foresight.
 _PAUSE = 0.7
 
@@ -42,6 +45,7 @@ class LocalPlannerSettings:
         far_steps: Steps over the rest of the time.
         least_duration: No plan is shorter [s].
         speed_limit: Largest speed per axis at the nodes [m/s].
+        force_limit: Largest force per axis [N]; None for no limit. It makes plans longer.
         margin_growth: Where the start lies inside a margin, the acceleration at which the margin
             grows from what there is [m/s^2].
         passes: Quadratic programs per guess at most.
@@ -65,6 +69,7 @@ class LocalPlannerSettings:
     far_steps: int = 8
     least_duration: float = 8.0
     speed_limit: float = 0.7
+    force_limit: float | None = None
     margin_growth: float = 0.05
     passes: int = 4
     tolerance: float = 0.01
@@ -81,7 +86,10 @@ class LocalPlannerSettings:
         """Check the values."""
         check_fields(self)
         for item in fields(self):
-            check_not_negative(item.name, getattr(self, item.name))
+            if item.name != "force_limit":
+                check_not_negative(item.name, getattr(self, item.name))
+        if self.force_limit is not None:
+            check_positive("force_limit", self.force_limit, "or None for no limit")
         for name in ("mass", "near_period", "speed_limit", "penalty", "qp_tolerance"):
             check_positive(name, getattr(self, name))
         # The second pass is the first that may know of the speed limit.
@@ -128,6 +136,9 @@ class LocalProblem:
         far = float(np.max(np.abs(goal - start[:2])))
         # From rest to rest the largest speed is 3/2 of the mean; the rest is leave for detours.
         duration = max(left, settings.least_duration, 2.0 * far / settings.speed_limit)
+        if settings.force_limit is not None:
+            most = _DIRECT_SHARE * settings.force_limit / settings.mass
+            duration = _duration_within(goal - start[:2], start[2:], duration, most)
         near = settings.near_period * np.arange(settings.near_steps)
         self.edges = np.concatenate(
             [near, np.linspace(settings.foresight, duration, settings.far_steps + 1)]
@@ -249,9 +260,20 @@ class LocalProblem:
         linear[2 * steps :] = settings.penalty
         least = np.full(size, -_UNBOUNDED)
         least[2 * steps :] = 0.0
+        most = np.full(size, _UNBOUNDED)
+        if settings.force_limit is not None:
+            least[: 2 * steps], most[: 2 * steps] = -settings.force_limit, settings.force_limit
         equality, target = self._arrival(size)
         values = _solve(
-            diagonal, linear, equality, target, inequality, low, high, least, settings.qp_tolerance
+            diagonal,
+            linear,
+            equality,
+            target,
+            inequality,
+            low,
+            high,
+            (least, most),
+            settings.qp_tolerance,
         )
         return None if values is None else values[: 2 * steps].reshape(2, steps).T
 
@@ -263,6 +285,28 @@ class LocalProblem:
         free = self.start[:2] + self.edges[-1] * self.start[2:]
         target = np.stack([self.goal - free, -self.start[2:]], axis=1).ravel()
         return equality, target
+
+
+def _duration_within(
+    way: FloatArray, speed: FloatArray, least: float, acceleration: float
+) -> float:
+    """Return a duration, at least the one given, in which a motion to rest needs little force.
+
+    Without obstacles the motion of least effort accelerates with 6 d / T^2 - 4 v / T at first and
+    with 2 v / T - 6 d / T^2 at last.
+
+    Args:
+        way: d per axis, shape (2,) [m].
+        speed: v at the start, shape (2,) [m/s].
+        least: No duration is shorter [s].
+        acceleration: The most per axis [m/s^2].
+    """
+    duration = least
+    while True:
+        even, fading = 6.0 * way / duration**2, 2.0 * speed / duration
+        if max(np.max(np.abs(even - 2.0 * fading)), np.max(np.abs(fading - even))) <= acceleration:
+            return duration
+        duration *= _LONGER
 
 
 def _instants(edges: FloatArray, settings: LocalPlannerSettings) -> tuple[FloatArray, BoolArray]:
@@ -289,7 +333,7 @@ def _solve(
     inequality: FloatArray,
     low: FloatArray,
     high: FloatArray,
-    least: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
     tolerance: float,
 ) -> FloatArray | None:
     """Return the optimum of a dense program with PIQP, or None if it fails."""
@@ -304,8 +348,7 @@ def _solve(
         inequality,
         low,
         high,
-        least,
-        np.full(len(linear), _UNBOUNDED),
+        *bounds,
     )
     status = solver.solve()
     values = np.array(solver.result.x)

@@ -219,6 +219,9 @@ class ScpSolver:
         violation = np.sum(np.abs(following - states[1:]))
         violation += np.sum(np.maximum(bounds[0] - inner, 0.0))
         violation += np.sum(np.maximum(inner - bounds[1], 0.0))
+        if self.control_limit < UNBOUNDED:
+            # A guess may exceed it; no program does.
+            violation += np.sum(np.maximum(np.abs(controls) - self.control_limit, 0.0))
         return float(np.sum(controls**2) * self.period + self.settings.penalty * violation)
 
     def _program(

@@ -55,6 +55,7 @@ class SpacecraftPlannerSettings:
             the states; the margin grows from there as above [m].
         speed_limit: Largest speed per axis; a node step at this speed must not cross an agent and
             its margins [m/s].
+        force_limit: Largest force per axis [N]; None for no limit.
         candidates: Solved plans among which the one of least effort is taken.
         restarts: Guesses from time-shifted shortest paths after the first guess.
         searches: Guesses by search in space and time, one agent after the other by priority; the
@@ -76,6 +77,7 @@ class SpacecraftPlannerSettings:
     margin_growth: float = 0.02
     start_margin: float = 0.12
     speed_limit: float = 0.7
+    force_limit: float | None = None
     candidates: int = 1
     restarts: int = 2
     searches: int = 2
@@ -88,6 +90,8 @@ class SpacecraftPlannerSettings:
         check_fields(self)
         for name in ("horizon", "control_period", "mass", "speed_limit", "check_period"):
             check_positive(name, getattr(self, name))
+        if self.force_limit is not None:
+            check_positive("force_limit", self.force_limit, "or None for no limit")
         for name in ("pair_share", "margin_growth", "start_margin"):
             check_not_negative(name, getattr(self, name))
         falling = sorted(self.margins, reverse=True)
@@ -226,6 +230,7 @@ class SpacecraftPlanner:
             np.maximum(settings.speed_limit, moving),
             scene.arrivals,
             scene.start_cost,
+            math.inf if settings.force_limit is None else settings.force_limit,
         )
 
     def _required(
