@@ -42,9 +42,10 @@ def settings() -> dict[str, str]:
     used = (blas_kernel() or "").lower()
     kernels = KERNELS.get(FAMILIES.get(machine, machine), ())
     other = next((name for name in kernels if name.lower() != used), None)
+    off = os.environ.get("NPY_DISABLE_CPU_FEATURES", "").replace(",", " ").split()
     return {
         **({} if other is None else {"OPENBLAS_CORETYPE": other}),
-        "NPY_DISABLE_CPU_FEATURES": ",".join(wide_features()),
+        "NPY_DISABLE_CPU_FEATURES": ",".join([*off, *wide_features()]),
         "ATEN_CPU_CAPABILITY": "default",  # torch
         "NUMBA_CPU_NAME": "generic",
     }

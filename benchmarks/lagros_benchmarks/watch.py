@@ -59,7 +59,13 @@ def watch(
             help="Write a .gif or .mp4 instead of opening a window.",
         ),
     ] = None,
-    speed: Annotated[float, typer.Option(help="How much faster than real time it plays.")] = 4.0,
+    speed: Annotated[
+        float | None,
+        typer.Option(
+            help="How much faster than real time it plays. (default: 1 for cartpole, 4 for "
+            "spacecraft)"
+        ),
+    ] = None,
     seconds: Annotated[
         float | None, typer.Option(help="End after so many seconds of the episode.")
     ] = None,

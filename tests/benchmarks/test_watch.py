@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import io
+import itertools
 import re
 import subprocess
 import sys
 
+import gymnasium
 import numpy as np
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from lagros_benchmarks import cli, playback, video
+from lagros_benchmarks import cli, video, watched
+from lagros_benchmarks.pictures import CartPolePictures
 from lagros_benchmarks.playback import Playback, WatchSettings
 from lagros_envs import spacecraft_v0
+from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.scenarios import Scenario
 
 pygame = pytest.importorskip("pygame")
@@ -124,9 +128,9 @@ def test_a_gif_shows_the_episode_at_the_speed_asked_for(invoke, tmp_path):
     )
     assert result.exit_code == 0, result.output
     frames, durations = frames_of(tmp_path / "x.gif")
-    # 6 s three times as fast, at no more than 6 frames per second, and the last frame for a while.
-    assert 1000 / min(durations) <= video.FRAME_RATES[".gif"]
-    assert sum(durations) / 1e3 == pytest.approx(6.0 / 3.0 + 1.5, abs=0.4)
+    # 6 s three times as fast, a frame for every second control step, and the last for a while.
+    assert 1000 / max(durations[:-1]) >= video.FRAME_RATES[".gif"]
+    assert sum(durations) / 1e3 == pytest.approx(6.0 / 3.0 + 1.5, abs=0.1)
     # The last frame is what the environment draws at that time.
     import pilots
 
@@ -137,10 +141,10 @@ def test_a_gif_shows_the_episode_at_the_speed_asked_for(invoke, tmp_path):
         rows = np.stack([observations[agent] for agent in env.agents])
         actions, _ = pilot.predict(rows, None, np.full(3, step == 0))
         observations, *_ = env.step(dict(zip(env.agents, actions, strict=True)))
-        if step % 5 == 4:
+        if step % 2 == 1:
             expected = env.render()
     env.close()
-    assert len(frames) == 13
+    assert len(frames) == 31
     wrong = np.abs(frames[-1].astype(int) - expected).max(axis=-1)
     assert np.mean(wrong > 24) < 0.01
     assert np.mean(np.abs(frames[0].astype(int) - expected).max(axis=-1) > 24) > 0.01
@@ -174,6 +178,40 @@ def test_the_cart_pole_is_filmed_too(invoke, tmp_path):
     frames, _ = frames_of(tmp_path / "c.gif")
     assert frames[0].shape == (400, 800, 3)
     assert np.any(frames[0] != frames[-1])
+
+
+def test_a_film_of_the_cart_pole_is_smooth_and_takes_its_time(invoke, tmp_path):
+    result = invoke("cartpole", "--policy", "lqr", "--seconds", 3, "--video", "c.gif")
+    assert result.exit_code == 0, result.output
+    frames, durations = frames_of(tmp_path / "c.gif")
+    # In real time, with one picture between two control instants; the last stays for 1.5 s.
+    assert len(frames) == 61
+    assert max(durations[:-1]) <= 50
+    assert sum(durations) / 1e3 == pytest.approx(3.0 + 1.5, abs=0.1)
+    moved = [np.any(first != second) for first, second in itertools.pairwise(frames)]
+    assert all(moved)
+    assert (tmp_path / "c.gif").stat().st_size < 1e6
+
+
+def test_the_picture_between_two_control_instants_is_where_the_cart_pole_is():
+    def cartpole(period):
+        settings = CartPoleSettings(control_period=period)
+        env = gymnasium.make("lagros/CartPole-v0", settings=settings, render_mode="rgb_array")
+        env.reset(
+            seed=3,
+            options={"nominal": np.outer(np.linspace(0.0, 1.0, settings.steps + 1), np.ones(4))},
+        )
+        return env.unwrapped
+
+    halves, whole = cartpole(0.05), cartpole(0.1)
+    halves.step(np.array([0.3]))
+    pictures = CartPolePictures(whole, "rgb_array", 10.0)
+    pictures.hold(np.array([0.3]))
+    whole.step(np.array([0.3]))
+    np.testing.assert_array_equal(pictures.draw(0.5, np.zeros(4)), halves.render())
+    halves.step(np.array([0.3]))
+    np.testing.assert_array_equal(pictures.draw(1.0, np.zeros(4)), halves.render())
+    pictures.close()
 
 
 def test_a_drawing_keeps_its_areas_in_the_palette():
@@ -252,7 +290,7 @@ def test_a_scenario_of_ones_own_is_played(invoke, tmp_path):
 
 def test_a_policy_that_plans_is_shown_with_its_plan(invoke, tmp_path):
     film = Playback(WatchSettings(policy="pilots:Planner", agents=2, video=tmp_path / "x.gif"))
-    film._game.start()
+    film._game.start("rgb_array", 10.0)
     world = film._game.env.episode.world
     film._game.step()
     apart = world.nominal_now()[0, :, :2] - world.scenarios[0].starts
@@ -299,16 +337,17 @@ def test_without_a_file_a_window_shows_it(invoke, monkeypatch):
 
 def test_closing_the_window_ends_the_episode(invoke, monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    closing = playback._SpacecraftGame.step
+    closing = watched.SpacecraftGame.step
 
     def step(self):
         pygame.event.post(pygame.event.Event(pygame.QUIT))
         return closing(self)
 
-    monkeypatch.setattr(playback._SpacecraftGame, "step", step)
+    monkeypatch.setattr(watched.SpacecraftGame, "step", step)
     result = invoke("spacecraft", "--policy", "pilots:Pilot", "--agents", 2, "--speed", 50)
     assert result.exit_code == 0, result.output
-    assert "in 0.1 s" in result.output
+    # It is asked after every frame: here, every twentieth control step.
+    assert "in 2.0 s" in result.output
 
 
 def test_where_no_window_opens_the_option_is_named(invoke, monkeypatch):
