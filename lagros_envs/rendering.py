@@ -34,7 +34,7 @@ CART_SIZE = (0.52, 0.26)  # width, height [m]
 SMALLEST_SPAN = 7.0  # width of the view when cart and goal are close [m]
 MARGIN = 1.5  # kept beside cart and goal [m] ...
 MARGIN_PIXELS = 110  # ... and at least this, where an arrow fits [px]
-TUBE_HEIGHT = 1.62  # of the coloured band above the rail [m]
+TUBE_HEIGHT = 1.62  # of the band that shows it, above the rail [m]
 ARROW_LENGTH = 80  # of a disturbance as large as its bound [px]
 PLOT_DURATION = 9.0  # shown at least [s]
 PLOT_HEIGHT = 3.5  # shown at least, in units of the state norm
@@ -98,7 +98,10 @@ class CartPoleRenderer(Canvas):
         self._centre = 0.5 * (left + right)
         distance = float(np.linalg.norm(state - goal))
         self._canvas.fill(WHITE)
-        self._draw_tube(float(goal[0]), tube_radius, inside=distance <= tube_radius)
+        # The tube is a ball in the whole state. At the angle and rates of x it reaches so far in p.
+        others = float(np.linalg.norm(state[1:] - goal[1:]))
+        reach = math.sqrt(max(0.0, tube_radius**2 - others**2))
+        self._draw_tube(float(goal[0]), tube_radius, reach)
         self._draw_rail()
         self._draw_cart_pole(goal, half_length, GREEN, ghost=True)
         if nominal is not None:
@@ -139,16 +142,19 @@ class CartPoleRenderer(Canvas):
         corner = ((WIDTH - 10) * OVERSAMPLING, start + 36 * OVERSAMPLING)
         self._text("p [m]", corner, GREY, 17, anchor="midright")
 
-    def _draw_tube(self, goal: float, radius: float, inside: bool) -> None:
+    def _draw_tube(self, goal: float, radius: float, reach: float) -> None:
+        """Draw how far the tube reaches in p: at the goal's angle and rates, and at those of x."""
         if radius <= 0.0:
             return
         colour = SKY_BLUE
         low, high = self._point(goal - radius, 0.0), self._point(goal + radius, 0.0)
         top = round(self._point(0.0, TUBE_HEIGHT)[1])
-        rectangle = self._pygame.Rect(
-            round(low[0]), top, max(1, round(high[0] - low[0])), round(low[1]) - top
-        )
-        self._canvas.fill(mix(colour, 0.3 if inside else 0.13), rectangle)
+        if reach > 0.0:
+            left, right = self._point(goal - reach, 0.0)[0], self._point(goal + reach, 0.0)[0]
+            rectangle = self._pygame.Rect(
+                round(left), top, max(1, round(right - left)), round(low[1]) - top
+            )
+            self._canvas.fill(mix(colour, 0.3), rectangle)
         for edge in (low[0], high[0]):
             self._dashed((edge, top), (edge, low[1]), colour, 2)
         # The radius, as a dimension line from the goal.
@@ -228,12 +234,13 @@ class CartPoleRenderer(Canvas):
         for index, row in enumerate(rows):
             place = (16 * OVERSAMPLING, (20 + 24 * index) * OVERSAMPLING)
             self._text(row, place, BLACK, 20, anchor="midleft")
-        if inside:
-            place = (16 * OVERSAMPLING, 68 * OVERSAMPLING)
-            self._text("inside the tube", place, BLUE, 20, anchor="midleft")
+        place = (16 * OVERSAMPLING, 68 * OVERSAMPLING)
+        where, colour = ("inside the tube", BLUE) if inside else ("outside the tube", VERMILLION)
+        self._text(where, place, colour, 20, anchor="midleft")
         keys: list[tuple[str, Colour, str]] = [
             ("ghost", GREEN, "goal x_f"),
-            ("box", SKY_BLUE, "tube r(t), darker inside"),
+            ("edge", SKY_BLUE, "tube ||x − x_f|| ≤ r(t)"),
+            ("box", SKY_BLUE, "p in the tube at this θ, rates"),
         ]
         if planned:
             keys.append(("ghost", PURPLE, "nominal x_d"))
@@ -248,6 +255,8 @@ class CartPoleRenderer(Canvas):
         level = height * OVERSAMPLING
         if shape == "ghost":
             self._dashed((left, level), (right, level), mix(colour, 0.7), 4)
+        elif shape == "edge":
+            self._dashed((left, level), (right, level), colour, 2)
         elif shape == "arrow":
             self._arrow((left, level), (right, level), colour, 3)
         else:

@@ -195,7 +195,7 @@ def test_a_film_of_the_cart_pole_is_smooth_and_takes_its_time(invoke, tmp_path):
 
 def test_the_picture_between_two_control_instants_is_where_the_cart_pole_is():
     def cartpole(period):
-        settings = CartPoleSettings(control_period=period)
+        settings = CartPoleSettings(control_period=period, time_limit=4.5)
         env = gymnasium.make("lagros/CartPole-v0", settings=settings, render_mode="rgb_array")
         env.reset(
             seed=3,

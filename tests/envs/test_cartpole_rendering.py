@@ -16,6 +16,7 @@ pygame_only = pytest.mark.skipif(
     not importlib.util.find_spec("pygame"), reason="the extra render is missing"
 )
 BLUE, ORANGE, VERMILLION = (0, 114, 178), (230, 159, 0), (213, 94, 0)
+FILLED = np.array([204, 231, 248])  # of the tube: 30 % of sky blue
 BELOW_LEGEND = 140  # [px]
 UPRIGHT = np.zeros(4)
 ZERO = np.zeros(1, np.float32)
@@ -96,6 +97,26 @@ def test_the_tube_grows_with_time():
     assert np.all(np.diff(widths) > 0)
     # 800 pixels show 7 m: r(6 s) = 3.064 m to either side.
     assert widths[-1] == pytest.approx(2 * 3.064 / 7.0 * 800, rel=0.03)
+
+
+@pygame_only
+@pytest.mark.parametrize("position", [0.5, 1.6, 1.9, 2.1, 2.6])
+@pytest.mark.parametrize("velocity", [0.0, -1.2, 3.0])
+def test_the_cart_stands_in_the_filled_band_if_and_only_if_the_state_is_in_the_tube(
+    position, velocity
+):
+    env = cartpole(render_mode="rgb_array")
+    env.reset(seed=0, options={"initial_state": UPRIGHT, "goal": 0.0})
+    for _ in range(20):
+        env.step(ZERO)
+    env._state = (position, 0.0, velocity, 0.0)
+    frame = env.render()
+    env.close()
+    inside = position**2 + velocity**2 <= env.settings.tube.radius(2.0) ** 2
+    _, cart = pixels(frame, BLUE)
+    filled = np.flatnonzero(np.all(np.abs(frame[240] - FILLED) <= 3, axis=-1))
+    reached = filled.size > 0 and filled.min() <= cart.mean() <= filled.max()
+    assert reached == inside
 
 
 @pygame_only
