@@ -136,17 +136,7 @@ def make(
     else:
         classes = _CARTPOLE
     if name in classes:
-<<<<<<< HEAD
         return _shipped(name, classes[name], world, allow_other_settings, settings)
-    if name.endswith(".zip"):
-        from lagros_policies.sb3_model import load_stable_baselines3
-
-        algorithm, _, path = name.rpartition(":")
-        return load_stable_baselines3(path, algorithm or None, **settings)
-    if ":" in name:
-        return _built(_class_named(name), world, allow_other_settings, settings)
-=======
-        return _shipped(name, classes[name], task, world, settings)
     model = model_file(name)
     if model is not None:
         from lagros_policies.sb3_model import load_stable_baselines3
@@ -154,8 +144,7 @@ def make(
         return load_stable_baselines3(model.path, model.algorithm, **settings)
     own = user_class(name)
     if own is not None:
-        return _built(_class_named(name, own), task, world, settings)
->>>>>>> 93c0dfb (Search the working folder last and only for a class named there; end workers with their parent)
+        return _built(_class_named(name, own), world, allow_other_settings, settings)
     near = difflib.get_close_matches(name, classes, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     raise ValueError(
