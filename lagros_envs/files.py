@@ -252,12 +252,13 @@ def _remove_stale(target: Path) -> None:
             if found is None or not entry.is_file(follow_symlinks=False):
                 continue
             ours = found["mark"] is not None or found["name"] == target.name
-            if ours and not _alive(int(found["pid"])) and _is_free(entry.path):
+            if ours and not is_alive(int(found["pid"])) and _is_free(entry.path):
                 with contextlib.suppress(OSError):
                     os.unlink(entry.path)
 
 
-def _alive(pid: int) -> bool:
+def is_alive(pid: int) -> bool:
+    """Return whether a process of this machine is at work."""
     if sys.platform == "win32":
         return True
     try:

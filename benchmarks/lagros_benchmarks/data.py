@@ -6,6 +6,7 @@ Only the standard library, typer and `terminal` are imported here; the commands 
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lagros_benchmarks.extras import check_extra
+from lagros_benchmarks.outputs import Delivery, check_outputs
 from lagros_benchmarks.terminal import fail, progress_bar
 
 if TYPE_CHECKING:
@@ -76,17 +78,27 @@ def export(
         fail(f"--{error}")
     try:
         check_free(out, dataset_id(task))
-    except (ValueError, OSError) as error:
+    except ValueError as error:
         fail(error)
     try:
         with progress_bar() as progress:
             flown, record = demonstrate(settings, lambda done: progress("episodes", done, episodes))
-        written = write_minari(out, settings, flown, record)
     except (ImportError, ValueError, OSError) as error:
-        # An extra that is not installed, a full disk, a dataset that came in between.
+        # An extra that is not installed, weights that are damaged.
         fail(error, status=1)
-    for line in summary(written, flown):
-        typer.echo(line)
+    made: list[Written] = []
+    # A full disk, a dataset that came in between: what was flown is kept elsewhere.
+    delivery = Delivery()
+    place = out / dataset_id(task)
+    delivery.write(
+        place,
+        lambda path: made.append(
+            write_minari(out if path == place else path, settings, flown, record)
+        ),
+    )
+    for written in made:
+        typer.echo(summary(written, flown))
+    delivery.tell(*(note(written, flown) for written in made))
     typer.echo(f"read it with {DATASETS_PATH}={out} and minari.load_dataset('{dataset_id(task)}')")
 
 
@@ -99,20 +111,17 @@ def check_free(folder: Path, identifier: str) -> None:
     """Check that a dataset can be written, before its episodes are flown.
 
     Raises:
-        ValueError: The folder already holds a dataset of this identifier.
-        OSError: The folder cannot be made.
+        ValueError: The folder already holds a dataset of this identifier, or takes no new file.
     """
+    from lagros_envs.files import remove_folders
+
     place = folder / identifier
-    if place.exists():
+    if os.path.lexists(place):
         raise ValueError(
             f"--out: {place} is already there; name another folder with --out, or remove it"
         )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OSError(
-            f"--out: cannot write to {folder} ({error}); name another folder with --out"
-        ) from error
+    # What is in the way of the dataset may lie further down than its folder.
+    remove_folders(check_outputs({}, folders={"--out": place.parent}))
 
 
 @dataclass(frozen=True)
@@ -149,17 +158,20 @@ def write_minari(
 
     Raises:
         ValueError: The folder already holds such a dataset.
+        OSError: It cannot be written, or such a dataset came in between.
     """
     from minari.namespace import create_namespace, list_local_namespaces
 
     identifier = dataset_id(settings.task)
     check_free(folder, identifier)
+    _remove_stale(folder)
     env = settings.make_env()
     try:
         outside = _outside(env, flown)
         extra = _record(flown, record, outside)
+        folder.mkdir(parents=True, exist_ok=True)
         # Under a hidden name, which Minari does not list, until the last byte is there.
-        with tempfile.TemporaryDirectory(prefix=".export-", dir=folder) as staging:
+        with tempfile.TemporaryDirectory(prefix=f".export-{os.getpid()}-", dir=folder) as staging:
             # Minari joins a relative path to itself.
             with _datasets_path(Path(staging).resolve()):
                 _create(identifier, env, settings, flown, extra)
@@ -175,16 +187,30 @@ def write_minari(
     return Written(place, sum(len(episode.rewards) for episode in flown), outside)
 
 
-def summary(written: Written, flown: Sequence[Demonstration]) -> list[str]:
-    """Return the lines that tell what was written."""
+def _remove_stale(folder: Path) -> None:
+    """Remove what exports have left behind that were killed."""
+    from lagros_envs.files import is_alive
+
+    for path in folder.glob(".export-*-*"):
+        pid = path.name.split("-")[1]
+        if pid.isdecimal() and not is_alive(int(pid)):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def summary(written: Written, flown: Sequence[Demonstration]) -> str:
+    """Return the line that tells what was flown."""
     successes = sum(episode.success for episode in flown)
     failed = sum(episode.counters["failed_plans"] for episode in flown)
-    size = sum(path.stat().st_size for path in written.place.rglob("*") if path.is_file()) / 1e6
-    return [
+    return (
         f"success in {successes} of {len(flown)} episodes; plans that failed: {failed}; "
-        f"actions outside the action space: {written.outside}",
-        f"wrote {written.place} ({len(flown)} episodes, {written.steps} steps, {size:.1f} MB)",
-    ]
+        f"actions outside the action space: {written.outside}"
+    )
+
+
+def note(written: Written, flown: Sequence[Demonstration]) -> str:
+    """Return what is worth knowing about the files that were written."""
+    size = sum(path.stat().st_size for path in written.place.rglob("*") if path.is_file()) / 1e6
+    return f"{len(flown)} episodes, {written.steps} steps, {size:.1f} MB"
 
 
 def _create(

@@ -24,13 +24,16 @@ _ANY = ".lagros"  # a name that no file of ours has
 
 def check_outputs(
     outputs: Paths, inputs: Paths | None = None, folders: Paths | None = None
-) -> None:
+) -> tuple[Path, ...]:
     """Check by trying that all files of a command can be written, and make their folders.
 
     Args:
         outputs: What the command writes.
         inputs: What it reads, and must not write over.
         folders: Where it writes files of its own choice.
+
+    Returns:
+        The folders that were made.
 
     Raises:
         ValueError: One cannot be written, two are one file, or one is what the command reads.
@@ -61,6 +64,7 @@ def check_outputs(
     except ValueError:
         remove_folders(made)
         raise
+    return made
 
 
 def policy_files(policies: Iterable[str]) -> dict[str, Path]:

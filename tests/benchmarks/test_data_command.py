@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
 import sys
+import tempfile
 
 import gymnasium as gym
 import numpy as np
@@ -206,6 +208,33 @@ def test_an_export_that_breaks_off_leaves_nothing(tmp_path, monkeypatch):
     assert json.loads((written.place / "data" / "metadata.json").read_text())["total_episodes"] == 1
 
 
+def test_a_dataset_that_cannot_be_written_is_kept_elsewhere(tmp_path, monkeypatch):
+    write = data.write_minari
+
+    def full(folder, *arguments):
+        if folder == tmp_path / "out":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(folder, *arguments)
+
+    monkeypatch.setattr(data, "write_minari", full)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    result = export("--minari", "--episodes", "1", "--out", str(tmp_path / "out"))
+    assert result.exit_code == 1
+    assert "No space left on device; it is kept as " in result.stderr
+    (kept,) = tmp_path.glob("lagros-*/expert-v0")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(kept))
+    assert minari.load_dataset(IDENTIFIER).total_episodes == 1
+
+
+def test_what_killed_exports_left_is_removed(tmp_path):
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    for pid in (ended.pid, os.getpid()):
+        (tmp_path / f".export-{pid}-x").mkdir()
+    data._remove_stale(tmp_path)
+    assert os.listdir(tmp_path) == [f".export-{os.getpid()}-x"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -215,7 +244,7 @@ def test_an_export_that_breaks_off_leaves_nothing(tmp_path, monkeypatch):
         (("--minari", "--seed", "-1"), "--seed=-1 must be a non-negative integer"),
         (("--minari", "--disturbance", "worst"), "--disturbance='worst' must be one of none,"),
         (("--minari", "--bound", "-1"), "--bound=-1.0 must be finite and >= 0"),
-        (("--minari", "--out", "/proc/none/x"), "name another folder with --out"),
+        (("--minari", "--out", "/proc/none/x"), "--out: cannot write '/proc/none/x"),
     ],
 )
 def test_a_mistake_is_explained_with_status_2_before_any_flight(grounded, arguments, message):

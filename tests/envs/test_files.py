@@ -272,7 +272,7 @@ def test_what_killed_writes_left_is_removed_and_nothing_else(tmp_path):
 
 def test_a_temporary_file_that_somebody_has_locked_stays(tmp_path, monkeypatch):
     # As on a shared disk, where its process belongs to another machine.
-    monkeypatch.setattr(files, "_alive", lambda pid: False)
+    monkeypatch.setattr(files, "is_alive", lambda pid: False)
     temporary, descriptor = files._open_temporary(tmp_path / "file")
     write_atomic(tmp_path / "file", "x")
     assert temporary.exists()
