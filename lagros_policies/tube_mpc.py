@@ -92,7 +92,7 @@ class TubeMpcPolicy:
         if metric is None:
             check_shipped_metric(self.settings, allow_other_settings)
         if metric is None or isinstance(metric, str | Path):
-            metric = load_metric(metric)
+            metric = load_metric(metric, task.STATE_DIM)
         self.expert = CartPoleExpert(metric, self.settings)
         self.replan_every = replan_every
         self.deadline = deadline

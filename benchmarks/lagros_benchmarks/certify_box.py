@@ -15,8 +15,6 @@ from lagros_policies.contraction.proof.program import ProvedDesignSettings
 from lagros_policies.contraction.statement import Statement
 
 _STATES = 4
-# Far beyond any design, and far below where binomials overflow.
-_MOST_DEGREE = 40
 # Multiples are tried in hundredths, whose bounds print as what they are; the largest of them.
 _HUNDREDTHS = 100
 _LARGEST = 150
@@ -33,17 +31,10 @@ def load_cartpole_metric(path: Path | None) -> Metric:
         ValueError: The file is no metric, or none of four states, or not symmetric to the last bit
             (the proofs use that W_bar is symmetric), or of a degree that nothing was designed for.
     """
-    metric = load_metric(path)
+    metric = load_metric(path, _STATES)
     coefficients = metric.coefficients
-    if coefficients.shape[1] != _STATES:
-        raise ValueError(
-            f"{path}: W_bar of size {coefficients.shape[1]} must be of the {_STATES} states "
-            "[p, theta, p_dot, theta_dot]"
-        )
     if not np.array_equal(coefficients, np.swapaxes(coefficients, 1, 2)):
         raise ValueError(f"{path}: W_bar must be symmetric to the last bit: average it with W_bar'")
-    if metric.degree > _MOST_DEGREE:
-        raise ValueError(f"{path}: degree {metric.degree} must be at most {_MOST_DEGREE}")
     return metric
 
 

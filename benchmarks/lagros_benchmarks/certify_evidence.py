@@ -19,7 +19,7 @@ from lagros_policies.contraction.certificate import Certificate
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.double_integrator import AxisMetric
 from lagros_policies.contraction.held_design import HeldDesign, HeldTube, design_held_contained
-from lagros_policies.contraction.metric import number
+from lagros_policies.contraction.metric_files import number
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.statement import Statement
 from lagros_policies.contraction.theorems import contraction_distance

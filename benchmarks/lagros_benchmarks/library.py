@@ -182,7 +182,7 @@ def load_metric(path: str | None) -> Callable[[FloatArray], FloatArray]:
     """Return M(x), states (..., n) to (..., n, n), of the shipped metric or of a file."""
     from lagros_policies.contraction import load_metric as load
 
-    matrix: Callable[[FloatArray], FloatArray] = load(path).matrix
+    matrix: Callable[[FloatArray], FloatArray] = load(path, states=4).matrix
     return matrix
 
 

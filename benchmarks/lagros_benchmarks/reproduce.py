@@ -142,10 +142,10 @@ def _metric(
     path = folder / "metric.json"
     begun = perf_counter()
     update("metric", 0, 1)
-    metric = made_before(lambda: load_metric(path), note)
+    metric = made_before(lambda: load_metric(path, states=4), note)
     if metric is None:
         save_metric(design_cartpole_metric(settings.metric, task), path)
-        metric = load_metric(path)
+        metric = load_metric(path, states=4)
     update("metric", 1, 1)
     check = metric.verification
     if check is not None:

@@ -1,15 +1,13 @@
 """Contraction metrics (CV-STEM), the robust control u* and the tubes that follow from them."""
 
+from lagros_policies.contraction.condition import Samples, contraction_residual, verify_metric
 from lagros_policies.contraction.control import HeldControl, robust_control
 from lagros_policies.contraction.cvstem import (
     CvStemSettings,
     InfeasibleError,
-    Samples,
-    contraction_residual,
     design_metric,
     design_on_pool,
     search_rate,
-    verify_metric,
 )
 from lagros_policies.contraction.metric import (
     ContractionMetric,
@@ -17,9 +15,8 @@ from lagros_policies.contraction.metric import (
     Region,
     Verification,
     extreme_eigenvalues,
-    load_metric,
-    save_metric,
 )
+from lagros_policies.contraction.metric_files import load_metric, save_metric
 from lagros_policies.contraction.tube import Tube, certified_tube, diverging_bound, tighten
 
 __all__ = [

@@ -31,8 +31,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.dynamics import System, hold_control_slope, vector_field
-from lagros_envs.dynamics.cartpole import ANGLE, VELOCITY
+from lagros_envs.dynamics.cartpole import VELOCITY
 from lagros_policies.contraction.control import HeldControl
+from lagros_policies.contraction.metric import at_angles, matrices_at
+from lagros_policies.contraction.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]
 # (x (..., n), u (..., 1)) -> Y (..., k) [N per unit of a].
@@ -42,7 +44,13 @@ _GRID = 41
 
 
 def friction_regressor(state: FloatArray, control: FloatArray) -> FloatArray:
-    """Return Y = -dp/dt, shape (..., 1): a is the true friction less the model's [N s/m]."""
+    """Return Y = -dp/dt, shape (..., 1): a is the true friction less the model's [N s/m].
+
+    Raises:
+        ValueError: The states are not of the cart-pole's four.
+    """
+    if np.shape(state)[-1:] != (4,):
+        raise ValueError(f"state of shape {np.shape(state)} must be the cart-pole's, (..., 4)")
     return -state[..., VELOCITY, None]
 
 
@@ -57,7 +65,11 @@ def cart_mass_regressor(model: System) -> Regressor:
     The equation of the cart reads (m_c + m) d2p/dt2 + ... = u, so that more mass is a force against
     the acceleration. Y takes the model's acceleration for the true one, which is right to first
     order in a.
+
+    Raises:
+        TypeError: The model is no cart-pole.
     """
+    check_cartpole(model, "cart_mass_regressor")
 
     def regressor(state: FloatArray, control: FloatArray) -> FloatArray:
         return -vector_field(model, state, control)[..., VELOCITY, None]
@@ -166,7 +178,7 @@ def largest_gain(
     """Return the diagonal of Gamma for which kappa is a share of 1 - exp(-2 alpha h).
 
     Args:
-        law: u*.
+        law: u* of the cart-pole.
         reach: Largest |Y| of each unknown in the region of interest [N per unit].
         share: Share of the limit, in (0, 1); split evenly between the unknowns.
 
@@ -174,13 +186,15 @@ def largest_gain(
         One number per unknown, in units of a^2 over those of V.
 
     Raises:
+        TypeError: The law is not that of a cart-pole.
         ValueError: A reach or the share is out of range.
     """
     if not reach or not min(reach) > 0.0 or not 0.0 < share < 1.0:
         raise ValueError(f"{reach=!r} must be > 0 and {share=!r} in (0, 1)")
-    states = np.zeros((_GRID, law.system.state_dim))
-    states[:, ANGLE] = np.linspace(0.0, law.metric.region.angle, _GRID)
+    check_cartpole(law.system, "largest_gain")
+    angles = np.linspace(0.0, law.metric.region.angle, _GRID)
+    states = at_angles(angles, law.system.state_dim)
     _, push = hold_control_slope(law.system, states, np.zeros((_GRID, 1)), law.period)
-    stiffness = np.einsum("si,sij,sj->s", push, law.metric.matrix(states), push).max()
+    stiffness = np.einsum("si,sij,sj->s", push, matrices_at(law.metric, angles), push).max()
     kappa = share * -math.expm1(-2.0 * law.rate * law.period)
     return tuple(kappa / (len(reach) * y * y * float(stiffness)) for y in reach)

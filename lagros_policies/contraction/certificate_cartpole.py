@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lagros_envs.dynamics import CartPole
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.certificate import Certificate, Stopwatch, TubeSizes
-from lagros_policies.contraction.cvstem import Samples
+from lagros_policies.contraction.condition import Samples
 from lagros_policies.contraction.ellipsoid import prove_tube
 from lagros_policies.contraction.held_design import HeldTube
 from lagros_policies.contraction.held_ellipsoid import held_statement, prove_held_tube
@@ -30,6 +30,7 @@ from lagros_policies.contraction.proof.condition import (
     prove_contraction,
 )
 from lagros_policies.contraction.statement import Statement, at_most
+from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 from lagros_policies.contraction.theorems import (
     disturbed_rate,
     feasibility_residual,
@@ -96,7 +97,13 @@ def cartpole_certificate(
             and taken as proved elsewhere if there are none.
         tubes: Tubes of constant metrics to prove as well.
         held: Tubes of a held control, likewise.
+
+    Raises:
+        TypeError: The system is no cart-pole, or the metric no polynomial.
+        ValueError: The metric is of other than four states.
     """
+    check_cartpole(system, "cartpole_certificate")
+    check_cartpole_metric(metric, "cartpole_certificate")
     watch = Stopwatch()
     lines = list(_contraction(system, metric, question) if proofs is None else proofs)
     # Without (14) nothing follows from it.

@@ -28,6 +28,7 @@ from lagros_policies.contraction.proof.spacecraft import (
     prove_spacecraft,
 )
 from lagros_policies.contraction.statement import Statement, at_most
+from lagros_policies.contraction.systems import check_spacecraft
 from lagros_policies.contraction.tube import diverging_bound
 
 FloatArray = NDArray[np.float64]
@@ -61,9 +62,11 @@ def spacecraft_certificate(
         policy: Whose learning error that is.
 
     Raises:
+        TypeError: The body is no spacecraft.
         ValueError: B B' depends on the heading, or the metric's coupling leaves no room for a
             finite nu.
     """
+    check_spacecraft(body, "spacecraft_certificate")
     watch = Stopwatch()
     square = control_square(body)
     if square is None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_positive
 from lagros_envs.dynamics import (
     System,
     control_matrix,
@@ -15,6 +16,7 @@ from lagros_envs.dynamics import (
     vector_field,
 )
 from lagros_policies.contraction.metric import ContractionMetric
+from lagros_policies.contraction.systems import check_angle, check_sizes
 
 FloatArray = NDArray[np.float64]
 
@@ -47,15 +49,28 @@ def contraction_terms(
 
     Returns:
         phi_0, shape (...), and phi_1, shape (..., m).
+
+    Raises:
+        ValueError: Metric, states and control are not of one system.
     """
+    n, m = system.state_dim, system.control_dim
+    check_sizes(
+        system,
+        state=(state, (n,)),
+        nominal=(nominal, (n,)),
+        nominal_control=(nominal_control, (m,)),
+    )
     error = state - nominal
-    matrix = metric.matrix(state)
+    matrix, gain = metric.matrix(state), control_matrix(system, state)
+    check_sizes(system, metric=(matrix, (n, n)))
     pull = np.einsum("...ij,...j->...i", matrix, error)
-    drift = vector_field(system, state, nominal_control)
-    drift = drift - vector_field(system, nominal, nominal_control)
+    motion = vector_field(system, state, nominal_control)
+    if getattr(metric, "depends_on_angle", False):
+        check_angle(system, state, motion, gain)
+    drift = motion - vector_field(system, nominal, nominal_control)
     phi_0 = 2.0 * np.einsum("...i,...i->...", pull, drift + rate * error)
     phi_0 = phi_0 + error_energy(metric.matrix_rate(state), error)
-    phi_1 = 2.0 * np.einsum("...ij,...i->...j", control_matrix(system, state), pull)
+    phi_1 = 2.0 * np.einsum("...ij,...i->...j", gain, pull)
     return phi_0, phi_1
 
 
@@ -112,7 +127,8 @@ class HeldControl:
         period: Control period dt [s].
 
     Raises:
-        ValueError: The system has more than one control, or the rate exceeds the metric's.
+        ValueError: The system has more than one control or other states than the metric, or the
+            rate exceeds the metric's.
     """
 
     system: System
@@ -127,6 +143,13 @@ class HeldControl:
                 f"HeldControl is closed form for one control, not {self.system.control_dim}; "
                 "use robust_control"
             )
+        size = len(self.metric.scaling)
+        if size != self.system.state_dim:
+            raise ValueError(
+                f"the metric is of {size} states and {self.system!r} has {self.system.state_dim}: "
+                "give a metric of this system"
+            )
+        check_positive("period", self.period)
         if not 0.0 < self.rate <= self.metric.contraction_rate:
             raise ValueError(
                 f"rate={self.rate!r} must be positive and at most the metric's own "

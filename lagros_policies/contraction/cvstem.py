@@ -15,24 +15,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from lagros_envs.checks import check_fields, check_positive, check_whole
-from lagros_envs.dynamics import System, control_matrix, state_dependent_coefficient
+from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
+from lagros_envs.dynamics import System
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
-from lagros_policies.contraction.metric import (
-    ContractionMetric,
-    DualMetric,
-    Metric,
-    Region,
-    Verification,
-    basis,
-    basis_rate,
-)
+from lagros_policies.contraction.condition import Samples, condition_terms, contraction_residual
+from lagros_policies.contraction.metric import Metric, Region, basis, basis_rate
 from lagros_policies.contraction.semidefinite import (
     ConeProgram,
     cone_rows,
@@ -40,9 +32,9 @@ from lagros_policies.contraction.semidefinite import (
     svec,
     symmetric_basis,
 )
+from lagros_policies.contraction.systems import check_angle, check_sizes
 
 FloatArray = NDArray[np.float64]
-Verified = TypeVar("Verified", bound=ContractionMetric)
 
 # Angles at which I <= W_bar(theta) <= chi I is imposed.
 _BOUND_ANGLES = 25
@@ -83,27 +75,9 @@ class CvStemSettings:
             raise ValueError(
                 f"control_penalty={self.control_penalty!r} must be > 0: without it nu is unbounded"
             )
-        if self.margin < 0.0 or not all(value > 0.0 for value in self.scaling):
-            raise ValueError("margin must be >= 0 and every scaling > 0")
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Triples at which the condition is imposed or checked.
-
-    Attributes:
-        state: x, shape (s, n).
-        nominal: x_d, shape (s, n).
-        nominal_control: u_d, shape (s, m).
-    """
-
-    state: FloatArray
-    nominal: FloatArray
-    nominal_control: FloatArray
-
-    def take(self, index: NDArray[np.intp]) -> Samples:
-        """Return the samples with these indices."""
-        return Samples(self.state[index], self.nominal[index], self.nominal_control[index])
+        check_not_negative("margin", self.margin)
+        for value in self.scaling:
+            check_positive("scaling", value)
 
 
 def design_metric(
@@ -123,6 +97,8 @@ def design_metric(
     Raises:
         InfeasibleError: No metric exists for this alpha, region and degree.
         RuntimeError: The solver stopped for another reason.
+        ValueError: Samples or scaling are not those of the system, or the degree is not 0 and state
+            1 of the system does not move at the rate of state 3.
     """
     problem = _assemble(system, samples, region, settings)
     values, status = solve_cones(problem)
@@ -252,77 +228,27 @@ def search_rate(
     return best, curve
 
 
-def contraction_residual(system: System, metric: DualMetric, samples: Samples) -> FloatArray:
-    """Return by how much the condition fails at each sample, relative to W_bar, shape (s,).
-
-    The largest eigenvalue of W_bar^-1/2 (-dW_bar/dt + 2 sym(A W_bar) - 2 nu B B'
-    + 2 alpha W_bar) W_bar^-1/2, in 1/s: the condition holds where it is not positive.
-    """
-    left = _condition(system, metric, samples)
-    values, vectors = np.linalg.eigh(metric.dual(samples.state))
-    if values.min() <= 0.0:
-        # Not a metric at all somewhere: no residual is large enough.
-        return np.where(values[:, 0] > 0.0, -np.inf, np.inf)
-    root = np.swapaxes(vectors / np.sqrt(values)[:, None, :], -1, -2)
-    relative = root @ left @ np.swapaxes(root, -1, -2)
-    return np.asarray(np.linalg.eigvalsh(relative)[..., -1], dtype=np.float64)
-
-
-def verify_metric(system: System, metric: Verified, samples: Samples, seed: int) -> Verified:
-    """Check the condition and I <= W_bar <= chi I on fresh samples and store the outcome.
-
-    Args:
-        system: The system.
-        metric: The metric.
-        samples: States that the design never saw.
-        seed: The seed they were drawn with, for the record.
-
-    Returns:
-        The metric with its `verification`.
-    """
-    residual = contraction_residual(system, metric, samples)
-    scaled = metric.dual(samples.state) * metric.scaling[:, None] * metric.scaling[None, :]
-    eigenvalues = np.linalg.eigvalsh(scaled)
-    # The semidefinite solver meets the bounds to about 1e-7 of chi.
-    slack = 1e-6 * metric.condition_bound
-    bounded = (eigenvalues[:, 0] >= 1.0 - slack) & (
-        eigenvalues[:, -1] <= metric.condition_bound + slack
-    )
-    broken = int(np.sum((residual > 0.0) | ~bounded))
-    return metric.verified(Verification(len(residual), broken, float(residual.max()), seed))
-
-
-def _condition(system: System, metric: DualMetric, samples: Samples) -> FloatArray:
-    slope = state_dependent_coefficient(
-        system, samples.state, samples.nominal, samples.nominal_control
-    )
-    gain = control_matrix(system, samples.state)
-    dual = metric.dual(samples.state)
-    product = slope @ dual
-    left: FloatArray = (
-        -metric.dual_rate(samples.state)
-        + product
-        + np.swapaxes(product, -1, -2)
-        - 2.0 * metric.control_weight * gain @ np.swapaxes(gain, -1, -2)
-        + 2.0 * metric.contraction_rate * dual
-    )
-    return left
+def _powers(state: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
+    """Return the basis at states (s, n) and its rate, both (s, degree + 1)."""
+    if degree == 0:
+        return np.ones((len(state), 1)), np.zeros((len(state), 1))
+    angle, rate = state[:, ANGLE], state[:, ANGULAR_RATE]
+    return basis(angle, degree), basis_rate(angle, rate, degree)
 
 
 def _assemble(
     system: System, samples: Samples, region: Region, settings: CvStemSettings
 ) -> ConeProgram:
     scale = np.asarray(settings.scaling)
-    slope = state_dependent_coefficient(
-        system, samples.state, samples.nominal, samples.nominal_control
-    )
+    n = system.state_dim
+    check_sizes(system, scaling=(scale, (n,)))
+    slope, gain, motion = condition_terms(system, samples)
+    if settings.degree > 0:
+        check_angle(system, samples.state, motion, gain)
     slope = slope * scale[:, None] / scale[None, :]
-    gain = control_matrix(system, samples.state) * scale[:, None]
-    n = scale.size
+    gain = gain * scale[:, None]
     symmetric = symmetric_basis(n)
-    angle, rate = samples.state[:, ANGLE], samples.state[:, ANGULAR_RATE]
-    powers = basis(angle, settings.degree)
-    power_rates = basis_rate(angle, rate, settings.degree)
+    powers, power_rates = _powers(samples.state, settings.degree)
     # d/dW_ij of the condition's left side, (s, degree + 1, basis, n, n).
     product = np.einsum("sab,jbc->sjac", slope, symmetric)
     both = product + np.swapaxes(product, -1, -2)

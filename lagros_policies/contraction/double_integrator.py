@@ -211,6 +211,7 @@ def certified_margin(metric: AxisMetric, disturbance_bound: float) -> float:
     Raises:
         ValueError: The metric has no period.
     """
+    check_not_negative("disturbance_bound", disturbance_bound)
     h = metric.period
     if h == 0.0:
         raise ValueError("a held control needs a metric with a period; see position_tube")
@@ -240,6 +241,8 @@ def expected_margin(disturbance_bound: float, rate: float) -> float:
         disturbance_bound: d_bar of the six states together.
         rate: alpha of u* [1/s].
     """
+    check_not_negative("disturbance_bound", disturbance_bound)
+    check_positive("rate", rate)
     return float(_EXPECTED_ERROR * disturbance_bound * rate**-_EXPECTED_POWER)
 
 
@@ -267,8 +270,8 @@ def rate_for_margin(disturbance_bound: float, margin: float) -> float:
     Raises:
         ValueError: The margin is not positive or the bound negative.
     """
-    if not margin > 0.0 or disturbance_bound < 0.0:
-        raise ValueError(f"{margin=!r} must be > 0 and {disturbance_bound=!r} >= 0")
+    check_positive("margin", margin)
+    check_not_negative("disturbance_bound", disturbance_bound)
     return float((_EXPECTED_ERROR * disturbance_bound / margin) ** (1.0 / _EXPECTED_POWER))
 
 

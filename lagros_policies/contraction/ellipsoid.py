@@ -16,11 +16,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import CartPole, System, control_matrix, vector_field
+from lagros_envs.dynamics import CartPole, control_matrix, vector_field
 from lagros_policies.contraction.metric import Metric, Region
 from lagros_policies.contraction.proof.cells import Examined, Search, search
 from lagros_policies.contraction.proof.intervals import Interval, exact, negative_definite
 from lagros_policies.contraction.proof.rates import RateCondition, Violation, rate_condition
+from lagros_policies.contraction.systems import check_cartpole
 from lagros_policies.contraction.tube_design import ConstantTube, TubeDesign
 
 FloatArray = NDArray[np.float64]
@@ -113,7 +114,11 @@ def prove_tube(system: CartPole, tube: ConstantTube, most_seconds: float = 60.0)
 
     Returns:
         The proof.
+
+    Raises:
+        TypeError: The system is no cart-pole.
     """
+    check_cartpole(system, "prove_tube")
     start = time.monotonic()
     if not tube.least_eigenvalue > 0.0:
         return TubeProof(tube, Search(False, 0, 0.0), False, time.monotonic() - start)
@@ -135,12 +140,19 @@ class TubeControl:
     dV/dt <= -2 alpha V. Closed form, for a control at will.
 
     Attributes:
-        system: The system.
+        system: The cart-pole.
         tube: The tube.
+
+    Raises:
+        TypeError: The system is no cart-pole.
     """
 
-    system: System
+    system: CartPole
     tube: ConstantTube
+
+    def __post_init__(self) -> None:
+        """Check the system."""
+        check_cartpole(self.system, "TubeControl")
 
     def terms(
         self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray

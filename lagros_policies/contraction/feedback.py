@@ -177,7 +177,22 @@ def gain_table(
 
     Returns:
         The table.
+
+    Raises:
+        ValueError: The plans have more than one control, or other states than there are weights.
     """
+    wanted = (len(times) - 1, by_state.shape[-1])
+    widths = {len(row) for one in (settings.tight, settings.gentle) for row in one.state}
+    if np.shape(by_control)[-2:] != wanted or np.shape(by_state)[-3:-1] != wanted:
+        raise ValueError(
+            f"by_state and by_control of shapes {np.shape(by_state)} and {np.shape(by_control)} "
+            f"must be (p, N, n, n) and (p, N, n) for {len(times)} times N + 1 and one control"
+        )
+    if widths != {wanted[1]}:
+        raise ValueError(
+            f"the weights are for {sorted(widths)} states, as the cart-pole's, and the plans have "
+            f"{wanted[1]}: give FeedbackSettings with weights for these"
+        )
     schedules = [schedule.at(times) for schedule in (settings.tight, settings.gentle)]
     state = np.stack([weights for weights, _ in schedules])[:, None]
     control = np.stack([weights for _, weights in schedules])[:, None, :-1]

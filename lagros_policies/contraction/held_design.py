@@ -42,6 +42,7 @@ from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.semidefinite import solve_conic, svec, symmetric_basis
+from lagros_policies.contraction.systems import check_cartpole
 from lagros_policies.contraction.tube_design import PlanBox, self_contained
 
 FloatArray = NDArray[np.float64]
@@ -209,10 +210,12 @@ def design_held(system: System, plan: PlanBox, error: FloatArray, design: HeldDe
         The tube.
 
     Raises:
+        TypeError: The system is no cart-pole.
         InfeasibleError: There is no such tube.
         RuntimeError: The solver stopped for another reason.
         ValueError: The box reaches pi/2.
     """
+    check_cartpole(system, "design_held")
     lifted, chosen = _samples(system, plan.with_errors(error))
     for _ in range(_ROUNDS):
         duals, status = _solve(lifted[chosen], design)

@@ -21,6 +21,7 @@ from lagros_policies.contraction.proof.intervals import (
 from lagros_policies.contraction.proof.lifted import LiftedCondition
 from lagros_policies.contraction.proof.rates import Violation
 from lagros_policies.contraction.statement import Statement, at_most
+from lagros_policies.contraction.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]
 
@@ -74,7 +75,11 @@ def prove_held_tube(system: CartPole, tube: HeldTube, most_seconds: float = 60.0
 
     Returns:
         The proof.
+
+    Raises:
+        TypeError: The system is no cart-pole.
     """
+    check_cartpole(system, "prove_held_tube")
     start = time.monotonic()
     definite = bool(np.all(negative_definite(exact(-tube.duals))))
     jumps = _falls_at_instants(tube)

@@ -26,8 +26,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_positive
+from lagros_envs.checks import check_not_negative, check_positive, check_whole
 from lagros_envs.dynamics.spacecraft import Spacecraft
+from lagros_policies.contraction.systems import check_spacecraft
 from lagros_policies.contraction.thrusters import held_thrust
 
 FloatArray = NDArray[np.float64]
@@ -120,6 +121,7 @@ class SlidingTracking:
         turning: The law of the heading, of the same period.
 
     Raises:
+        TypeError: The body is no spacecraft.
         ValueError: The periods differ.
     """
 
@@ -129,6 +131,7 @@ class SlidingTracking:
 
     def __post_init__(self) -> None:
         """Check the periods."""
+        check_spacecraft(self.body, type(self).__name__)
         if self.plane.period != self.turning.period:
             raise ValueError(
                 f"plane and turning need one period, not {self.plane.period!r} and "
@@ -207,11 +210,10 @@ def hierarchical_bound(
     Raises:
         ValueError: A number is negative.
     """
-    if min(disturbance_bound, initial_sliding, initial_error) < 0.0 or steps < 0:
-        raise ValueError(
-            f"{disturbance_bound=!r}, {steps=!r}, {initial_sliding=!r} and {initial_error=!r} "
-            "must be >= 0"
-        )
+    check_not_negative("disturbance_bound", disturbance_bound)
+    check_not_negative("initial_sliding", initial_sliding)
+    check_not_negative("initial_error", initial_error)
+    check_whole("steps", steps, 0)
     sliding_push, position_push = _pushes(axis)
     rate = axis.position_rate
     sliding, position = np.empty(steps + 1), np.empty(steps + 1)
@@ -233,6 +235,7 @@ def steady_position_bound(axis: SlidingAxis, disturbance_bound: float) -> float:
     Between instants the position leaves the chord of its ends by at most h^2/8 of the deviation and
     (h/2 + h^2/8) d_bar, as in `double_integrator.certified_margin`.
     """
+    check_not_negative("disturbance_bound", disturbance_bound)
     sliding_push, position_push = _pushes(axis)
     # What the bounds at the instants rise to, from zero: the fixed point of their recursion.
     sliding = sliding_push * disturbance_bound / -math.expm1(-axis.sliding_rate * axis.period)
@@ -250,6 +253,7 @@ def peak_position_error(axis: SlidingAxis, disturbance_bound: float) -> float:
     (d_p, d_v), constant over its hold, points where its own effect on the last position is largest.
     The sum of these effects is exact, not only a bound; the hierarchical bound lies above it.
     """
+    check_not_negative("disturbance_bound", disturbance_bound)
     h, rate = axis.period, axis.position_rate
     step = np.array([[axis.position_factor, axis.coupling], [0.0, axis.sliding_factor]])
     # Effects of unit d_p and d_v over one hold on (q~, s).

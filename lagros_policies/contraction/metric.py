@@ -1,26 +1,29 @@
-"""A contraction metric: what it is, where it was verified, and how it is stored."""
+"""A contraction metric: what it is, and where it was verified."""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
-from pathlib import Path
-from typing import Any, Protocol, Self
+from dataclasses import dataclass, fields, replace
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_at_least, check_positive
+from lagros_envs.checks import check_at_least, check_positive, check_whole
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
-from lagros_envs.files import write_atomic
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-_FORMAT = "lagros-metric-1"
-_NETWORK = ".safetensors"
+_STATES = 4  # of a metric of the angle: [p, theta, dp/dt, dtheta/dt]
+# Far beyond any design, and far below where binomials overflow.
+_MOST_DEGREE = 40
+# Angles at which W_bar must be positive definite, and its least eigenvalue, of W_bar scaled to a
+# unit diagonal: far above rounding, far below any design.
+_ANGLES = 101
+_LEAST = 1e-13
+# Rounding of W_ij against W_ji, as a share of the largest entry.
+_ASYMMETRY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,17 @@ class Region:
     def contains(
         self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
     ) -> BoolArray:
-        """Return which triples (x, x_d, u_d) of a batch (..., 4), (..., 4), (..., 1) lie inside."""
+        """Return which triples (x, x_d, u_d) of a batch (..., 4), (..., 4), (..., 1) lie inside.
+
+        Raises:
+            ValueError: They are not of the cart-pole's four states and one control.
+        """
+        shapes = [np.shape(part)[-1:] for part in (state, nominal, nominal_control)]
+        if shapes != [(_STATES,), (_STATES,), (1,)]:
+            raise ValueError(
+                f"states and control end in {shapes}: a Region bounds the cart-pole's four states "
+                "[p, theta, dp/dt, dtheta/dt] and one force"
+            )
         error = np.abs(state - nominal)
         inside = np.abs(nominal_control[..., 0]) <= self.force
         for point in (state, nominal):
@@ -88,6 +101,21 @@ class Verification:
     violations: int
     worst: float
     seed: int
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ValueError: A count is none, or the worst is not a number.
+        """
+        check_whole("samples", self.samples)
+        check_whole("violations", self.violations, 0)
+        check_whole("seed", self.seed, 0)
+        if self.violations > self.samples or math.isnan(self.worst):
+            raise ValueError(
+                f"violations={self.violations!r} of samples={self.samples!r}, worst="
+                f"{self.worst!r}: there cannot be more than samples, and the worst is a number"
+            )
 
 
 class DualMetric(Protocol):
@@ -153,8 +181,9 @@ class Metric:
         verification: The independent check, or None.
 
     Raises:
-        ValueError: The arrays do not fit each other or are not symmetric, or a number is out of
-            range.
+        ValueError: The arrays do not fit each other or are not symmetric, W_bar depends on the
+            angle of other than four states or is not positive definite at the angles of the region,
+            or a number is out of range.
     """
 
     coefficients: FloatArray
@@ -168,33 +197,74 @@ class Metric:
     def __post_init__(self) -> None:
         """Check the arrays."""
         shape = self.coefficients.shape
-        if len(shape) != 3 or shape[1] != shape[2] or self.scaling.shape != shape[1:2]:
+        fits = len(shape) == 3 and shape[1] == shape[2] and self.scaling.shape == shape[1:2]
+        if not fits or 0 in shape:
             raise ValueError(
                 f"coefficients of shape {shape} and scaling of shape {self.scaling.shape} "
                 "must be (degree + 1, n, n) and (n,)"
             )
-        if not np.allclose(self.coefficients, np.swapaxes(self.coefficients, 1, 2)):
-            raise ValueError("every coefficient of W_bar must be symmetric")
-        numbers = (self.contraction_rate, self.condition_bound, self.control_weight, *self.scaling)
-        if not (
-            np.all(np.isfinite(self.coefficients)) and all(0.0 < n < math.inf for n in numbers)
-        ):
-            raise ValueError("W_bar must be finite; alpha, chi, nu and scaling finite and positive")
+        if self.degree > 0 and shape[1] != _STATES:
+            raise ValueError(
+                f"coefficients of shape {shape}: a W_bar of the angle is of the four states "
+                "[p, theta, dp/dt, dtheta/dt]; one of other states is constant, with degree 0"
+            )
+        if self.degree > _MOST_DEGREE:
+            raise ValueError(f"coefficients: degree {self.degree} must be at most {_MOST_DEGREE}")
+        if not np.all(np.isfinite(self.coefficients)):
+            raise ValueError("coefficients must be finite: there is an infinity or no number")
+        for name in ("contraction_rate", "condition_bound", "control_weight"):
+            check_positive(name, getattr(self, name))
+        for entry in self.scaling:
+            check_positive("scaling", float(entry))
         check_at_least("condition_bound", self.condition_bound, 1)
+        self._check_definite()
+
+    def _check_definite(self) -> None:
+        crossed = np.swapaxes(self.coefficients, 1, 2)
+        largest = np.abs(self.coefficients).max(axis=(1, 2), keepdims=True)
+        if np.any(np.abs(self.coefficients - crossed) > _ASYMMETRY * largest):
+            raise ValueError("coefficients: every W_i must be symmetric; average it with W_i'")
+        angles = np.linspace(0.0, self.region.angle, _ANGLES) if self.degree else np.zeros(1)
+        dual = self.dual(at_angles(angles, len(self.scaling)))
+        sizes = np.einsum("sii->si", dual)
+        worst = int(np.argmin(sizes.min(axis=1)))
+        least = float(sizes[worst].min())
+        if least > 0.0:
+            root = np.sqrt(sizes)
+            values = np.linalg.eigvalsh(dual / (root[:, :, None] * root[:, None, :]))[:, 0]
+            worst = int(np.argmin(values))
+            least = float(values[worst])
+        if not least > _LEAST:
+            where = f" at the angle {angles[worst]:.4g} rad of the region" if self.degree else ""
+            raise ValueError(
+                f"coefficients: W_bar is not positive definite{where} (least eigenvalue about "
+                f"{least:.3g}), so that e'W_bar^-1 e measures no distance: check their signs"
+            )
 
     @property
     def degree(self) -> int:
         """Degree of W_bar in cos(theta)."""
         return len(self.coefficients) - 1
 
+    @property
+    def depends_on_angle(self) -> bool:
+        """Whether W_bar depends on state 1, whose rate is taken to be state 3."""
+        return self.degree > 0
+
     def dual(self, state: FloatArray) -> FloatArray:
         """Return W_bar(x), shape (..., n, n), for states (..., n)."""
+        self._check_width(state)
+        if self.degree == 0:
+            return np.tile(self.coefficients[0], (*np.shape(state)[:-1], 1, 1))
         powers = basis(state[..., ANGLE], self.degree)
         value: FloatArray = np.einsum("...i,ijk->...jk", powers, self.coefficients)
         return value
 
     def dual_rate(self, state: FloatArray) -> FloatArray:
         """Return dW_bar/dt along dtheta/dt of the state, shape (..., n, n)."""
+        self._check_width(state)
+        if self.degree == 0:
+            return np.zeros((*np.shape(state), len(self.scaling)))
         value: FloatArray = np.einsum(
             "...i,ijk->...jk",
             basis_rate(state[..., ANGLE], state[..., ANGULAR_RATE], self.degree),
@@ -211,6 +281,13 @@ class Metric:
         matrix = self.matrix(state)
         return -matrix @ self.dual_rate(state) @ matrix
 
+    def _check_width(self, state: FloatArray) -> None:
+        if np.shape(state)[-1:] != self.scaling.shape:
+            raise ValueError(
+                f"states of shape {np.shape(state)} must be (..., {len(self.scaling)}): the metric "
+                f"is of {len(self.scaling)} states"
+            )
+
     def verified(self, check: Verification) -> Self:
         """Return the metric with the outcome of a check."""
         return replace(self, verification=check)
@@ -220,13 +297,48 @@ def extreme_eigenvalues(metric: ContractionMetric, points: int = 401) -> tuple[f
     """Return the extreme eigenvalues of M over a grid of the region's angles (observed).
 
     Args:
-        metric: A metric that is even in the angle.
-        points: Angles from 0 to the region's largest.
+        metric: A metric that is constant, or of the angle alone.
+        points: Angles from 0 to the region's largest, each with both signs.
+
+    Raises:
+        ValueError: The metric depends on more than the angle, or is not positive definite.
     """
-    states = np.zeros((points, len(metric.scaling)))
-    states[:, ANGLE] = np.linspace(0.0, metric.region.angle, points)
-    values = np.linalg.eigvalsh(metric.matrix(states))
+    check_at_least("points", points, 2)
+    angles = np.linspace(0.0, metric.region.angle, points)
+    values = np.linalg.eigvalsh(
+        np.concatenate([matrices_at(metric, angles), matrices_at(metric, -angles)])
+    )
+    if not values.min() > 0.0:
+        raise ValueError(f"{metric!r} is not positive definite on its region: it is no metric")
     return float(values.min()), float(values.max())
+
+
+def at_angles(angles: FloatArray, size: int) -> FloatArray:
+    """Return states (..., size) at angles (...), zero but for the angle where there is one."""
+    states = np.zeros((*np.shape(angles), size))
+    if size > ANGLE:
+        states[..., ANGLE] = angles
+    return states
+
+
+def matrices_at(metric: ContractionMetric, angles: FloatArray) -> FloatArray:
+    """Return M at angles (s,), shape (s, n, n), for a metric of nothing but the angle.
+
+    Raises:
+        ValueError: At other states with these angles M is another.
+    """
+    size = len(metric.scaling)
+    states = at_angles(angles, size)
+    matrix = metric.matrix(states)
+    elsewhere = np.random.default_rng(0).uniform(-1.0, 1.0, states.shape)
+    if size > ANGLE:
+        elsewhere[:, ANGLE] = states[:, ANGLE]
+    if not np.allclose(metric.matrix(elsewhere), matrix, rtol=1e-9, atol=0.0):
+        raise ValueError(
+            f"{metric!r} depends on more of the state than the angle x[{ANGLE}]: the angles of its "
+            "region say nothing of its other values"
+        )
+    return matrix
 
 
 def basis(angle: FloatArray, degree: int) -> FloatArray:
@@ -241,151 +353,3 @@ def basis_rate(angle: FloatArray, angular_rate: FloatArray, degree: int) -> Floa
     lower = np.cos(angle)[..., None] ** np.maximum(exponents - 1, 0)
     rates: FloatArray = -exponents * lower * (np.sin(angle) * angular_rate)[..., None]
     return rates
-
-
-def metric_record(metric: Metric) -> dict[str, Any]:
-    """Return a metric as the JSON object that `load_metric` reads; numbers keep every bit."""
-    return {
-        "format": _FORMAT,
-        "basis": "cos(theta)^i",
-        "coefficients": metric.coefficients.tolist(),
-        **design_record(metric),
-    }
-
-
-def design_record(metric: ContractionMetric) -> dict[str, Any]:
-    """Return what the file of any metric says of its design; numbers keep every bit."""
-    return {
-        "alpha": metric.contraction_rate,
-        "chi": metric.condition_bound,
-        "nu": metric.control_weight,
-        "scaling": metric.scaling.tolist(),
-        "region": asdict(metric.region),
-        "verification": None if metric.verification is None else asdict(metric.verification),
-    }
-
-
-def design_arguments(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of a metric from what `design_record` made.
-
-    Args:
-        record: The record, with any other entries.
-
-    Raises:
-        KeyError: An entry is missing.
-        TypeError: An entry has a wrong type.
-        ValueError: A number is out of range, or is text or true or false.
-    """
-    check = record["verification"]
-    only_numbers(record["region"], "region")
-    if check is not None:
-        only_numbers(check, "verification")
-    return {
-        "contraction_rate": number(record, "alpha"),
-        "condition_bound": number(record, "chi"),
-        "control_weight": number(record, "nu"),
-        "scaling": numbers(record, "scaling"),
-        "region": Region(**record["region"]),
-        "verification": None if check is None else Verification(**check),
-    }
-
-
-def number(record: Mapping[str, Any], name: str) -> float:
-    """Return a number of a JSON object; text and true, which Python takes for one, are refused.
-
-    Args:
-        record: The object.
-        name: Key of the number.
-
-    Raises:
-        KeyError: There is no such key.
-        ValueError: It is no number.
-    """
-    value = record[name]
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{name}={value!r} must be a number: write it without quotes")
-    return float(value)
-
-
-def numbers(record: Mapping[str, Any], name: str) -> FloatArray:
-    """Return nested lists of numbers of a JSON object as an array; see `number`.
-
-    Raises:
-        KeyError: There is no such key.
-        ValueError: An entry is no number, or the lists are of different lengths.
-    """
-    only_numbers(record[name], name)
-    return np.array(record[name], dtype=np.float64)
-
-
-def only_numbers(value: Any, name: str) -> None:
-    """Refuse text, true, false and null anywhere inside lists and objects of JSON.
-
-    Args:
-        value: What JSON was read to.
-        name: What it is called in the message.
-
-    Raises:
-        ValueError: There is one.
-    """
-    if isinstance(value, Mapping | list):
-        for item in value.values() if isinstance(value, Mapping) else value:
-            only_numbers(item, name)
-    elif isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{name} holds {value!r}, which must be a number: write it without quotes")
-
-
-def read_text(path: Path | str) -> str:
-    """Return the text of a metric's file, which is JSON; a network is refused by name.
-
-    Args:
-        path: The file.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is a network, or no text.
-    """
-    data = Path(path).read_bytes()
-    try:
-        text = data.decode()
-    except UnicodeDecodeError:
-        text = ""
-    if Path(path).suffix == _NETWORK or (data and not text):
-        raise ValueError(
-            f"{path} is no JSON: a network is neither read nor proved here, only a polynomial is. "
-            "Give a file of save_metric, as `python -m lagros_policies.contraction.proof.design "
-            "--out FILE` writes; for networks there is load_neural_metric, and their condition is "
-            "checked on samples"
-        )
-    return text
-
-
-def save_metric(metric: Metric, path: Path | str) -> None:
-    """Write a metric as JSON, atomically; numbers keep every bit."""
-    write_atomic(path, json.dumps(metric_record(metric), indent=1) + "\n")
-
-
-def load_metric(path: Path | str | None = None) -> Metric:
-    """Read a metric.
-
-    Args:
-        path: A file written by `save_metric`; None for the shipped cart-pole metric.
-
-    Returns:
-        The metric.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is not a metric, is a network, or is damaged.
-    """
-    if path is None:
-        path = Path(__file__).parents[1] / "pretrained" / "cartpole_metric.json"
-    text = read_text(path)
-    try:
-        record = json.loads(text)
-        if record["format"] != _FORMAT:
-            raise ValueError(f"format {record['format']!r} is not {_FORMAT!r}")
-        return Metric(numbers(record, "coefficients"), **design_arguments(record))
-    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        reason = f"it has no {error}" if isinstance(error, KeyError) else error
-        raise ValueError(f"{path} is not a metric written by save_metric: {reason}") from error

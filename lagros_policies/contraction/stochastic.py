@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_not_negative, check_positive
+from lagros_envs.checks import check_at_least, check_not_negative, check_positive
 from lagros_envs.dynamics import System, hold_step
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.double_integrator import AxisMetric
-from lagros_policies.contraction.metric import ContractionMetric
+from lagros_policies.contraction.metric import ContractionMetric, at_angles, matrices_at
 
 FloatArray = NDArray[np.float64]
 
@@ -97,28 +97,29 @@ def mean_square_bound(
     the state stays in the region: noise leaves any region at some time, if rarely.
 
     Args:
-        metric: A metric of the angle.
-        intensity: g, shape (4,) [unit of the state / sqrt(s)].
+        metric: A metric that is constant, or of the angle alone.
+        intensity: g, shape (n,) [unit of the state / sqrt(s)].
         initial_energy: V(0).
 
     Returns:
         The bound, with the eps that makes the steady value least.
 
     Raises:
-        ValueError: The noise of the angle is too strong for the metric's rate.
+        ValueError: The noise of the angle is too strong for the metric's rate, the metric depends
+            on more than the angle, or a number is out of range.
     """
     size = len(metric.scaling)
     squares = checked_intensity(intensity, size) ** 2
-    states = np.zeros((_GRID, size))
-    states[:, ANGLE] = np.linspace(-metric.region.angle, metric.region.angle, _GRID)
-    states[:, ANGULAR_RATE] = 1.0
-    matrix = metric.matrix(states)
+    check_not_negative("initial_energy", initial_energy)
+    angles = np.linspace(-metric.region.angle, metric.region.angle, _GRID)
+    matrix = matrices_at(metric, angles)
     power = float(np.max(np.einsum("sii,i->s", matrix, squares)))
     least = float(np.linalg.eigvalsh(matrix)[:, 0].min())
-    angle_power = float(squares[ANGLE])
-    if angle_power == 0.0:
+    angle_power = float(squares[ANGLE]) if size > ANGLE else 0.0
+    # A metric that says nothing of an angle may be anybody's, and depend on one.
+    if angle_power == 0.0 or not getattr(metric, "depends_on_angle", True):
         return MeanSquareBound(metric.contraction_rate, power, least, initial_energy)
-    first, second = _variation(metric, states, matrix)
+    first, second = _variation(metric, angles, matrix)
     eps = _SHARES * metric.contraction_rate / angle_power
     rates = metric.contraction_rate - 0.5 * angle_power * (eps + 0.5 * second)
     powers = power + angle_power * first**2 / eps
@@ -133,9 +134,11 @@ def mean_square_bound(
 
 
 def _variation(
-    metric: ContractionMetric, states: FloatArray, matrix: FloatArray
+    metric: ContractionMetric, angles: FloatArray, matrix: FloatArray
 ) -> tuple[float, float]:
     """Return mu_1 and mu_2 over the grid."""
+    states = at_angles(angles, len(metric.scaling))
+    states[:, ANGULAR_RATE] = 1.0
     slope = metric.matrix_rate(states)  # the states turn at 1 rad/s
     ahead, behind = states.copy(), states.copy()
     ahead[:, ANGLE] += _ANGLE_STEP
@@ -236,8 +239,9 @@ def noisy_hold_step(
     Returns:
         The states at its end, shape (..., n).
     """
+    check_at_least("substeps", substeps, 1)
     half = 0.5 * duration / substeps
-    spread = np.asarray(intensity) * math.sqrt(2.0 * half)
+    spread = checked_intensity(intensity, system.state_dim) * math.sqrt(2.0 * half)
     for _ in range(substeps):
         state = hold_step(system, state, control, half, substeps=1)
         state = state + spread * rng.standard_normal(state.shape)

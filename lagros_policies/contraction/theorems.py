@@ -29,19 +29,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_at_least, check_not_negative, check_positive
 from lagros_envs.dynamics import (
     CartPole,
     System,
     control_matrix,
-    state_dependent_coefficient,
 )
+from lagros_policies.contraction.condition import Samples, condition_left
 from lagros_policies.contraction.control import contraction_terms
-from lagros_policies.contraction.cvstem import Samples
 from lagros_policies.contraction.metric import DualMetric, Metric
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.proof.intervals import Interval, exact, negative_definite
 from lagros_policies.contraction.proof.motion import accelerations, jacobian_parts, metric_series
 from lagros_policies.contraction.proof.series import variable
+from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 
 FloatArray = NDArray[np.float64]
 
@@ -80,6 +81,9 @@ def metric_drift(metric: Metric, angle: float, cells: int = 2000) -> float:
     Raises:
         ValueError: It cannot be shown with so many cells.
     """
+    check_cartpole_metric(metric, "metric_drift")
+    check_positive("angle", angle)
+    check_at_least("cells", cells, 1)
     if metric.degree == 0:
         return 0.0
     # W is even in the angle: one half of it will do.
@@ -114,6 +118,8 @@ def disturbed_rate(metric: Metric, drift: float, angle_disturbance: float) -> fl
         angle_disturbance: Bound of the disturbance of the angle's own equation [rad/s]; d_bar, if
             it is not known to be less, and zero if only the rates are disturbed.
     """
+    check_not_negative("drift", drift)
+    check_not_negative("angle_disturbance", angle_disturbance)
     return metric.contraction_rate - 0.5 * drift * angle_disturbance
 
 
@@ -129,8 +135,11 @@ def lipschitz_constant(system: CartPole, box: ProofBox, cells: int = 2000) -> Li
         cells: Equal intervals of the angle.
 
     Raises:
+        TypeError: The system is no cart-pole.
         ValueError: The box has a lean.
     """
+    check_cartpole(system, "lipschitz_constant")
+    check_at_least("cells", cells, 1)
     if box.lean:
         raise ValueError(f"lean={box.lean!r} must be 0: state the force of the box instead")
     start = time.monotonic()
@@ -168,14 +177,8 @@ def gain_residual(
         samples: Where to look.
         share: s.
     """
-    slope = state_dependent_coefficient(
-        system, samples.state, samples.nominal, samples.nominal_control
-    )
-    dual, gain = metric.dual(samples.state), control_matrix(system, samples.state)
-    product = slope @ dual
-    left = product + np.swapaxes(product, -1, -2) - metric.dual_rate(samples.state)
-    left = left + 2.0 * metric.contraction_rate * dual
-    left = left - 2.0 * share * metric.control_weight * gain @ np.swapaxes(gain, -1, -2)
+    left = condition_left(system, metric, samples, share)
+    dual = metric.dual(samples.state)
     worst = np.linalg.eigvalsh(left)[:, -1] / np.trace(dual, axis1=-2, axis2=-1)
     return np.asarray(worst, dtype=np.float64)
 
@@ -251,8 +254,8 @@ def tube_ball(rng: np.random.Generator, nominal: FloatArray, radius: FloatArray)
     Raises:
         ValueError: A radius is negative.
     """
-    if np.any(radius < 0.0):
-        raise ValueError(f"radius={float(np.min(radius))!r} must be >= 0")
+    if not np.all(np.isfinite(radius) & (np.asarray(radius) >= 0.0)):
+        raise ValueError(f"radius={np.asarray(radius).tolist()!r} must be finite and >= 0")
     direction = rng.standard_normal(nominal.shape)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     size = radius * rng.random(nominal.shape[:-1]) ** (1.0 / nominal.shape[-1])

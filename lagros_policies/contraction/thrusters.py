@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.dynamics.spacecraft import HEADING, SPIN, Spacecraft
+from lagros_policies.contraction.systems import check_spacecraft
 
 FloatArray = NDArray[np.float64]
 
@@ -42,6 +43,7 @@ def allocate(body: Spacecraft, wrench: FloatArray) -> FloatArray:
 @lru_cache(maxsize=16)
 def allocation_matrix(body: Spacecraft) -> FloatArray:
     """Return the matrix (3, 8) of the signed thrusters s = G'(G G')^-1 w, each with both signs."""
+    check_spacecraft(body, "allocation_matrix")
     share = 2.0 * (body.arm**2 + body.side_arm**2)
     turn, side_turn = body.arm / share, body.side_arm / share
     signed = np.array(
@@ -60,6 +62,7 @@ def allocation_matrix(body: Spacecraft) -> FloatArray:
 
 def least_effort(body: Spacecraft, wrench: FloatArray) -> FloatArray:
     """Return min ||u||^2 for wrenches (..., 3), shape (...) [N^2]."""
+    check_spacecraft(body, "least_effort")
     lever = 2.0 * (body.arm**2 + body.side_arm**2)
     effort: FloatArray = 0.5 * np.sum(wrench[..., :2] ** 2, axis=-1) + wrench[..., 2] ** 2 / lever
     return effort
@@ -86,6 +89,7 @@ def wrench_of_acceleration(
     Returns:
         The wrench in the body's axes, shape (..., 3) [N, N, N m].
     """
+    check_spacecraft(body, "wrench_of_acceleration")
     force = to_body(body.mass * acceleration[..., :2], state[..., HEADING])
     torque = 2.0 * body.inertia * acceleration[..., 2:]
     return np.concatenate([force, torque], axis=-1)

@@ -113,9 +113,16 @@ def diverging_bound(
         The bound of ||e(t)||, of the shape of `time`.
 
     Raises:
-        ValueError: The Lipschitz constant is not positive.
+        ValueError: The Lipschitz constant is not positive, or a bound negative or not finite.
     """
     check_above("lipschitz", lipschitz, 0)
+    for name, value in {
+        "disturbance_bound": disturbance_bound,
+        "learning_error": learning_error,
+        "control_gain": control_gain,
+        "initial_error": initial_error,
+    }.items():
+        check_not_negative(name, value)
     push = control_gain * learning_error + disturbance_bound
     growth = np.expm1(lipschitz * time)
     bound: FloatArray = initial_error * (growth + 1.0) + push / lipschitz * growth
@@ -134,10 +141,10 @@ def tighten(low: FloatArray, high: FloatArray, radius: FloatArray) -> tuple[Floa
         The bounds that the target trajectory must keep.
 
     Raises:
-        ValueError: The tube is wider than the interval.
+        ValueError: The tube is wider than the interval, or its radius negative or no number.
     """
     tight_low, tight_high = low + radius, high - radius
-    if np.any(tight_low > tight_high):
+    if not np.all(tight_low <= tight_high) or np.any(radius < 0.0):
         widest = float(np.max(radius))
         raise ValueError(
             f"the tube (radius up to {widest:.3g}) is wider than the admissible interval: "

@@ -34,6 +34,7 @@ from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.proof.condition import ProofBox
 from lagros_policies.contraction.semidefinite import solve_conic, svec, symmetric_basis
+from lagros_policies.contraction.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]
 Method = Literal["paper", "output", "ellipsoid"]
@@ -77,8 +78,11 @@ class PlanBox:
         """Return the box of x and x_d for errors of at most `error`, shape (4,).
 
         Raises:
-            ValueError: The angle reaches pi/2.
+            ValueError: The errors are not four finite numbers >= 0, or the angle reaches pi/2.
         """
+        values = np.asarray(error, dtype=np.float64)
+        if values.shape != (4,) or not np.all(np.isfinite(values) & (values >= 0.0)):
+            raise ValueError(f"error={values.tolist()!r} must be four finite numbers >= 0")
         return ProofBox(
             angle=self.angle + float(error[ANGLE]),
             velocity=self.velocity + float(error[VELOCITY]),
@@ -228,10 +232,12 @@ def design_constant(
         The tube.
 
     Raises:
+        TypeError: The system is no cart-pole.
         InfeasibleError: There is no such constant metric.
         RuntimeError: The solver stopped for another reason.
         ValueError: The box reaches pi/2.
     """
+    check_cartpole(system, "design_constant")
     slope, gain = _samples(system, plan.with_errors(error))
     dual, weight, status = _solve(slope, gain, design)
     if dual is None:

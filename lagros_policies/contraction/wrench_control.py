@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from lagros_envs.checks import check_positive
 from lagros_envs.dynamics.spacecraft import Spacecraft
 from lagros_policies.contraction.double_integrator import AxisMetric, design_axis, flow
+from lagros_policies.contraction.systems import check_spacecraft
 from lagros_policies.contraction.thrusters import held_thrust
 
 FloatArray = NDArray[np.float64]
@@ -95,6 +96,7 @@ class WrenchTracking:
         turning: Metric of the heading, of the same period.
 
     Raises:
+        TypeError: The body is no spacecraft.
         ValueError: The periods differ, or are zero.
     """
 
@@ -104,6 +106,7 @@ class WrenchTracking:
 
     def __post_init__(self) -> None:
         """Check the periods."""
+        check_spacecraft(self.body, type(self).__name__)
         if self.plane.period != self.turning.period or self.plane.period == 0.0:
             raise ValueError(
                 f"plane and turning need one period > 0, not {self.plane.period!r} and "

@@ -14,7 +14,7 @@ from lagros_benchmarks import certify, certify_evidence, cli
 from lagros_policies.contraction import load_metric, save_metric
 from lagros_policies.contraction.certificate import Certificate, TubeSizes
 from lagros_policies.contraction.ellipsoid_axis import AxisEllipsoid, prove_axis_ellipsoid
-from lagros_policies.contraction.metric import metric_record
+from lagros_policies.contraction.metric_files import metric_record
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.statement import Statement
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lagros_envs.dynamics import Spacecraft, jacobian
-from lagros_policies.contraction import certificate_spacecraft, load_metric
+from lagros_policies.contraction import Region, certificate_spacecraft, load_metric
 from lagros_policies.contraction.certificate_cartpole import (
     CartPoleQuestion,
     cartpole_certificate,
@@ -107,12 +107,21 @@ def test_a_disturbance_too_large_for_the_metric_leaves_a_tube_of_the_rates(syste
     assert found.tube.certified == pytest.approx(large / found.alpha * math.sqrt(found.chi))
 
 
+def thin(metric):
+    """Return a metric that is positive definite at the angles of its region, and not beyond."""
+    coefficients = metric.coefficients.copy()
+    # Less a multiple of 1 - cos(theta).
+    coefficients[0] -= 1e6 * np.eye(4)
+    coefficients[1] += 1e6 * np.eye(4)
+    return replace(metric, coefficients=coefficients, region=Region(angle=1e-6))
+
+
 @pytest.mark.parametrize(
     "spoil",
     [
         pytest.param(lambda m: replace(m, contraction_rate=3.0), id="larger alpha"),
         pytest.param(lambda m: replace(m, control_weight=1e-9), id="no control"),
-        pytest.param(lambda m: replace(m, coefficients=-m.coefficients), id="not positive"),
+        pytest.param(thin, id="not positive"),
     ],
 )
 def test_the_certificate_of_a_bad_metric_does_not_hold(system, spoil):

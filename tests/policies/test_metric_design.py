@@ -1,6 +1,7 @@
 """CV-STEM against the same program stated in cvxpy, and its condition against the definition."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cvxpy as cp
 import numpy as np
@@ -116,8 +117,20 @@ def test_residual_is_the_largest_relative_eigenvalue_of_the_condition(
 
 
 def test_a_metric_that_is_not_positive_has_an_infinite_residual(system, metric, samples):
-    broken = replace(metric, coefficients=metric.coefficients - 1e4 * np.eye(4))
-    assert np.all(contraction_residual(system, broken, samples) == np.inf)
+    """It is infinite where it is none, and what it is where it is one."""
+    one = samples.state[:, 0] > 0.0
+    sign = np.where(one, 1.0, -1.0)[:, None, None]
+    broken = SimpleNamespace(
+        contraction_rate=metric.contraction_rate,
+        control_weight=metric.control_weight,
+        dual=lambda state: sign * metric.dual(state),
+        dual_rate=lambda state: sign * metric.dual_rate(state),
+    )
+    residual = contraction_residual(system, broken, samples)
+    assert 0 < one.sum() < len(one)
+    assert np.all(residual[~one] == np.inf)
+    whole = contraction_residual(system, metric, samples)
+    assert residual[one] == pytest.approx(whole[one], rel=1e-12)
 
 
 def test_sdc_matrix_in_the_region_turns_the_error_into_the_difference_of_the_rates(

@@ -168,6 +168,73 @@ def test_missing_entry_is_refused_by_name(saved, key):
         load_metric(path)
 
 
+EYE = np.eye(4)
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        pytest.param({"coefficients": [np.zeros((4, 4))]}, "coefficients", id="zero"),
+        pytest.param({"coefficients": [-EYE]}, "coefficients", id="negative"),
+        pytest.param({"coefficients": [np.diag([1.0, 1, 1, -1])]}, "coefficients", id="indefinite"),
+        pytest.param({"coefficients": [np.ones((4, 4))]}, "coefficients", id="singular"),
+        # 1 - 2 (1 - cos(theta)) is below zero from 60 degrees on, which the region reaches.
+        pytest.param({"coefficients": [-EYE, 2 * EYE]}, "coefficients", id="later indefinite"),
+        # Entries far below an absolute tolerance are asymmetric all the same.
+        pytest.param(
+            {"coefficients": [1e-9 * (EYE + np.triu(0.1 * np.ones((4, 4)), 1))]},
+            "coefficients",
+            id="tiny asymmetric",
+        ),
+        pytest.param({"coefficients": [np.eye(3)]}, "coefficients", id="three states"),
+        pytest.param({"coefficients": np.zeros((0, 4, 4))}, "coefficients", id="no degree"),
+        pytest.param({"coefficients": np.zeros((1, 0, 0))}, "coefficients", id="no state"),
+        pytest.param({"coefficients": [EYE] * 50}, "coefficients", id="degree"),
+        pytest.param({"coefficients": [[[10**400] * 4] * 4]}, "coefficients", id="huge"),
+        pytest.param({"coefficients": {"a": 1.0}}, "coefficients", id="object"),
+        pytest.param({"coefficients": 7}, "coefficients", id="number"),
+        pytest.param({"basis": "theta^i"}, "basis", id="another basis"),
+        pytest.param({"alpha": 10**400}, "alpha", id="huge alpha"),
+        pytest.param({"alpha": [1.0]}, "alpha", id="list"),
+        pytest.param({"chi": 0.5}, "condition_bound", id="chi"),
+        pytest.param({"nu": 0}, "control_weight", id="nu"),
+        pytest.param({"scaling": [1.0, 1.0, 0.0, 1.0]}, "scaling", id="scaling"),
+        pytest.param({"scaling": 1.0}, "scaling", id="scaling of no dimension"),
+        pytest.param({"region": {}}, "region", id="empty region"),
+        pytest.param({"region": {"angle": 1.0, "wide": 2.0}}, "region", id="unknown bound"),
+        pytest.param({"verification": {"samples": 3}}, "verification", id="half a check"),
+        pytest.param(
+            {"verification": {"samples": 3, "violations": 4, "worst": 0.0, "seed": 0}},
+            "violations",
+            id="more violations than samples",
+        ),
+        pytest.param(
+            {"verification": {"samples": 2.5, "violations": 0, "worst": 0.0, "seed": 0}},
+            "samples",
+            id="half a sample",
+        ),
+    ],
+)
+def test_what_is_no_metric_is_refused_with_file_and_field(saved, change, field):
+    _, path = saved
+    record = {**json.loads(path.read_text()), **change}
+    record["coefficients"] = np.asarray(record["coefficients"], dtype=object).tolist()
+    path.write_text(json.dumps(record))
+    with pytest.raises(ValueError, match=rf"{path.name} is not a metric .*{field}") as caught:
+        load_metric(path, 4)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_metric_of_other_states_is_loaded_where_it_is_asked_for(saved):
+    _, path = saved
+    record = json.loads(path.read_text())
+    change = {"coefficients": [np.eye(3).tolist()], "scaling": [1.0] * 3}
+    path.write_text(json.dumps({**record, **change}))
+    assert load_metric(path).dual(np.zeros((2, 3))).shape == (2, 3, 3)
+    with pytest.raises(ValueError, match=r"coefficients are of 3 states; the system has 4"):
+        load_metric(path, 4)
+
+
 def test_metric_refuses_arrays_that_do_not_fit(metric):
     with pytest.raises(ValueError, match="symmetric"):
         replace(metric, coefficients=metric.coefficients + np.triu(np.ones((4, 4)), 1))

@@ -19,16 +19,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import System, control_matrix, state_dependent_coefficient
+from lagros_envs.checks import check_at_least
+from lagros_envs.dynamics import System
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
-from lagros_policies.contraction.cvstem import (
-    CvStemSettings,
-    InfeasibleError,
-    Samples,
-    contraction_residual,
-)
+from lagros_policies.contraction.condition import Samples, condition_terms, contraction_residual
+from lagros_policies.contraction.cvstem import CvStemSettings, InfeasibleError
 from lagros_policies.contraction.metric import Region
 from lagros_policies.contraction.neural.metric import SIZE
+from lagros_policies.contraction.systems import check_cartpole, check_sizes
 
 FloatArray = NDArray[np.float64]
 
@@ -52,6 +50,11 @@ class AngleSolution:
     control_weight: float
     condition_bound: float
     scaling: FloatArray
+
+    @property
+    def depends_on_angle(self) -> bool:
+        """Always: W_bar is of state 1, whose rate is taken to be state 3."""
+        return True
 
     def dual(self, state: FloatArray) -> FloatArray:
         """Return W_bar(x), shape (..., 4, 4), linear in cos(theta) between the angles."""
@@ -102,17 +105,20 @@ def solve_at_angles(
         The solution.
 
     Raises:
+        TypeError: The system is no cart-pole.
         InfeasibleError: There is none.
+        ValueError: The samples are not of the system, or there is no second angle.
     """
     import cvxpy as cp
 
+    check_cartpole(system, "solve_at_angles")
+    check_at_least("angles", angles, 2)
     nodes = np.linspace(0.0, region.angle, angles)
     scale = np.asarray(settings.scaling)
-    slope = state_dependent_coefficient(
-        system, samples.state, samples.nominal, samples.nominal_control
-    )
+    check_sizes(system, scaling=(scale, (SIZE,)))
+    slope, gain, _ = condition_terms(system, samples)
     slope = slope * scale[:, None] / scale[None, :]
-    gain = control_matrix(system, samples.state) * scale[:, None]
+    gain = gain * scale[:, None]
     shares, share_slopes = hats(samples.state[:, ANGLE], nodes)
     rate = settings.contraction_rate + settings.margin
     duals = [cp.Variable((SIZE, SIZE), symmetric=True) for _ in nodes]

@@ -30,9 +30,9 @@ from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.metric import (
     Region,
     Verification,
-    design_arguments,
-    design_record,
+    at_angles,
 )
+from lagros_policies.contraction.metric_files import design_arguments, design_record
 from lagros_policies.imitation.networks import Mlp
 
 FloatArray = NDArray[np.float64]
@@ -41,6 +41,8 @@ SIZE = 4
 OUTPUTS = SIZE * (SIZE + 1) // 2
 _ROWS, _COLUMNS = np.tril_indices(SIZE)
 _DIAGONAL = _ROWS == _COLUMNS
+# Angles at which M must be positive definite.
+_ANGLES = 41
 _FORMAT = "lagros-neural-metric-1"
 
 
@@ -84,13 +86,28 @@ class NeuralMetric:
         for entry in self.scaling:
             check_positive("scaling", entry)
 
+        angles = np.linspace(0.0, self.region.angle, _ANGLES)
+        matrices = self.matrix(at_angles(angles, SIZE))
+        if not np.all(np.isfinite(matrices)) or np.linalg.eigvalsh(matrices).min() <= 0.0:
+            raise ValueError(
+                "the network's M is not finite and positive definite on the region: its weights "
+                "are too large, or no numbers"
+            )
+
+    @property
+    def depends_on_angle(self) -> bool:
+        """Always: M is of state 1, whose rate is taken to be state 3."""
+        return True
+
     def matrix(self, state: FloatArray) -> FloatArray:
         """Return M(x), shape (..., 4, 4), for states (..., 4)."""
+        self._check_width(state)
         factor, _ = self._factor(state[..., ANGLE])
         return factor @ np.swapaxes(factor, -1, -2)
 
     def matrix_rate(self, state: FloatArray) -> FloatArray:
         """Return dM/dt along dtheta/dt of the state, shape (..., 4, 4)."""
+        self._check_width(state)
         factor, slope = self._factor(state[..., ANGLE])
         half = slope @ np.swapaxes(factor, -1, -2)
         rate = state[..., ANGULAR_RATE, None, None]
@@ -109,6 +126,10 @@ class NeuralMetric:
     def verified(self, check: Verification) -> Self:
         """Return the metric with the outcome of a check."""
         return replace(self, verification=check)
+
+    def _check_width(self, state: FloatArray) -> None:
+        if np.shape(state)[-1:] != (SIZE,):
+            raise ValueError(f"states of shape {np.shape(state)} must be (..., {SIZE})")
 
     def _factor(self, angle: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return S L and d(S L)/dtheta, both (..., 4, 4), at angles (...)."""
@@ -176,7 +197,8 @@ def load_neural_metric(path: Path | str | None = None) -> NeuralMetric:
         if record["kind"] != _FORMAT:
             raise ValueError(f"kind {record['kind']!r} is not {_FORMAT!r}")
         return NeuralMetric(network, **design_arguments(record))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        reason = f"it has no {error}" if isinstance(error, KeyError) else error
         raise ValueError(
-            f"{path} is not a metric written by save_neural_metric: {error!r}"
+            f"{path} is not a metric written by save_neural_metric: {reason}"
         ) from error

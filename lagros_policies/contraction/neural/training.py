@@ -19,7 +19,7 @@ from lagros_envs.checks import (
 )
 from lagros_envs.dynamics import System, control_matrix, state_dependent_coefficient
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
-from lagros_policies.contraction.cvstem import Samples
+from lagros_policies.contraction.condition import Samples
 from lagros_policies.contraction.metric import Region
 from lagros_policies.contraction.neural.design import AngleSolution
 from lagros_policies.contraction.neural.metric import (
@@ -29,6 +29,7 @@ from lagros_policies.contraction.neural.metric import (
     feature,
     feature_slope,
 )
+from lagros_policies.contraction.systems import check_cartpole
 from lagros_policies.imitation.networks import Mlp
 
 FloatArray = NDArray[np.float64]
@@ -99,6 +100,7 @@ def fit_network(
     Returns:
         The metric, not yet verified.
     """
+    check_cartpole(system, "fit_network")
     settings = settings or NeuralTrainingSettings()
     weights, biases = _train(system, pool, solution, region, settings)
     angles = np.linspace(0.0, region.angle, _CHECK_ANGLES)

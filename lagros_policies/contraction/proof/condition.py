@@ -29,7 +29,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import CartPole, System
+from lagros_envs.checks import check_at_least, check_positive
+from lagros_envs.dynamics import System
 from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.proof.box import ProofBox
@@ -43,6 +44,7 @@ from lagros_policies.contraction.proof.intervals import (
 from lagros_policies.contraction.proof.motion import metric_series
 from lagros_policies.contraction.proof.rates import Violation, rate_condition
 from lagros_policies.contraction.proof.series import variable
+from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 
 __all__ = [
     "ContractionProof",
@@ -131,12 +133,13 @@ def prove_contraction(
         The proof, or why there is none.
 
     Raises:
-        TypeError: The system is no cart-pole, whose structure the proof uses.
+        TypeError: The system is no cart-pole, whose structure the proof uses, or the metric no
+            polynomial.
     """
-    if not isinstance(system, CartPole):
-        raise TypeError(f"system={system!r} must be a CartPole: the proof uses its structure")
+    cartpole = check_cartpole(system, "prove_contraction")
+    check_cartpole_metric(metric, "prove_contraction")
     rate = metric.contraction_rate if contraction_rate is None else contraction_rate
-    found = search(rate_condition(system, metric, box, rate), _BATCH, most_boxes, most_seconds)
+    found = search(rate_condition(cartpole, metric, box, rate), _BATCH, most_boxes, most_seconds)
     return ContractionProof(
         box, rate, found.proved, found.cells, found.seconds, found.failure, found.undecided
     )
@@ -193,8 +196,13 @@ def prove_bounds(system: System, metric: Metric, angle: float, cells: int = 2000
         The bounds.
 
     Raises:
+        TypeError: The system is no cart-pole: B of another may depend on more than the angle.
         ValueError: W_bar cannot be shown to be positive definite with so many cells.
     """
+    check_cartpole(system, "prove_bounds")
+    check_cartpole_metric(metric, "prove_bounds")
+    check_positive("angle", angle)
+    check_at_least("cells", cells, 1)
     start = time.monotonic()
     ends = np.linspace(-angle, angle, cells + 1)
     thetas = Interval(ends[:-1], ends[1:])

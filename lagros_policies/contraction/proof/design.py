@@ -17,7 +17,8 @@ from pathlib import Path
 
 from lagros_envs.dynamics import CartPole
 from lagros_envs.files import write_atomic
-from lagros_policies.contraction.metric import Metric, metric_record
+from lagros_policies.contraction.metric import Metric
+from lagros_policies.contraction.metric_files import metric_record
 from lagros_policies.contraction.proof.cartpole import CartPoleProof, prove_cartpole
 from lagros_policies.contraction.proof.program import (
     Points,

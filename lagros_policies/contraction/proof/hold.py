@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_positive
 from lagros_envs.dynamics import CartPole, dual
 from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_envs.dynamics.integrate import rk4_hold
@@ -35,6 +36,7 @@ from lagros_policies.contraction.proof.cells import Examined, grid, remainder
 from lagros_policies.contraction.proof.intervals import Interval, exact, matmul, transpose
 from lagros_policies.contraction.proof.motion import accelerations, metric_series
 from lagros_policies.contraction.proof.series import Series, variable
+from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -81,6 +83,10 @@ class HoldCondition:
         period: float,
     ) -> None:
         """Bound the push."""
+        check_cartpole(system, type(self).__name__)
+        check_cartpole_metric(metric, type(self).__name__)
+        check_positive("contraction_rate", contraction_rate)
+        check_positive("period", period)
         self.system, self.metric, self.box, self.period = system, metric, box, period
         # The exponential of the library errs by less than one unit in the last place.
         self.decay = math.nextafter(math.exp(-2.0 * contraction_rate * period), 0.0)

@@ -27,6 +27,7 @@ from lagros_policies.contraction.proof.motion import (
     twice_symmetric,
 )
 from lagros_policies.contraction.proof.rates import Violation
+from lagros_policies.contraction.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -55,6 +56,7 @@ class LiftedCondition:
 
     def __init__(self, system: CartPole, box: ProofBox, dual: FloatArray, rest: Interval) -> None:
         """Bound the push and the square of the rate."""
+        check_cartpole(system, type(self).__name__)
         if box.lean != 0.0:
             raise ValueError(f"lean={box.lean!r} must be 0: forces that lean are not covered here")
         self.system, self.box = system, box

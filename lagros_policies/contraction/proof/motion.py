@@ -24,6 +24,7 @@ from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.proof import series
 from lagros_policies.contraction.proof.intervals import Interval, exact, matmul, transpose
 from lagros_policies.contraction.proof.series import Series, variable
+from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 
 FloatArray = NDArray[np.float64]
 _STATES = 4
@@ -112,6 +113,7 @@ def accelerations(system: CartPole, angle: Interval, order: int) -> Acceleration
     Returns:
         The parts.
     """
+    check_cartpole(system, "accelerations")
     place = variable(angle, order)
     zero = place * 0.0
 
@@ -132,6 +134,7 @@ def accelerations(system: CartPole, angle: Interval, order: int) -> Acceleration
 
 def jacobian_parts(system: CartPole, parts: Accelerations) -> JacobianParts:
     """Enclose the Jacobian, one order less than the accelerations."""
+    check_cartpole(system, "jacobian_parts")
     order = len(parts.still.parts) - 2
     push_slope = parts.by_push.differentiated()
     balance = _indexed(Series(parts.balance.parts[: order + 1]), (..., None))
@@ -168,6 +171,7 @@ def metric_series(metric: Metric, angle: Series) -> Series:
     The polynomial is expanded about the cosine of the midpoint, itself by intervals: its
     coefficients are large and of both signs, and intervals would not see that they cancel.
     """
+    check_cartpole_metric(metric, "metric_series")
     cosine = series.cos(angle)
     centre = cosine.parts[0].midpoint
     gap = _indexed(cosine - centre, (..., None, None))

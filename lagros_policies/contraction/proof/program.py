@@ -30,6 +30,7 @@ from lagros_policies.contraction.semidefinite import (
     svec,
     symmetric_basis,
 )
+from lagros_policies.contraction.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]
 
@@ -112,6 +113,7 @@ def corners(system: CartPole, box: ProofBox, angles: int = 21, rates: int = 5) -
         angles: Angles of x from 0 to the largest.
         rates: Rates of y.
     """
+    check_cartpole(system, "corners")
     far = box.angle_error > 0.0
     gaps = np.linspace(-1.0, 1.0, 5 if far else 1) * min(box.angle_error, 2.0 * box.angle)
     points = []
@@ -154,6 +156,7 @@ def design_on_points(
         InfeasibleError: No such metric exists.
         RuntimeError: The points were not satisfied, or the solver stopped.
     """
+    check_cartpole(system, "design_on_points")
     active = np.arange(0, len(pool.state), max(len(pool.state) // _ADDED, 1))
     active_held = np.arange(0, len(held.state), max(len(held.state) // _ADDED, 1))
     for _ in range(_PROGRAMS):

@@ -42,6 +42,7 @@ from lagros_policies.contraction.proof.motion import (
     twice_symmetric,
 )
 from lagros_policies.contraction.proof.series import variable
+from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -91,6 +92,8 @@ class RateCondition:
 
     def __init__(self, system: CartPole, metric: Metric, box: ProofBox) -> None:
         """Bound the push."""
+        check_cartpole(system, type(self).__name__)
+        check_cartpole_metric(metric, type(self).__name__)
         self.system, self.metric, self.box = system, metric, box
         self.apart = box.angle_error >= 2.0 * box.angle
         self.rate_error = min(box.angular_rate_error, 2.0 * box.angular_rate)
@@ -301,6 +304,8 @@ def triangle_tip(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatAr
 
 def fails(system: CartPole, metric: Metric, point: Violation) -> bool:
     """Show by intervals, and the motion's own Jacobian, that the condition fails at a point."""
+    check_cartpole(system, "fails")
+    check_cartpole_metric(metric, "fails")
     slope, _ = interval_jacobian(system, exact(point.nominal), exact(point.control))
     _, gain = interval_jacobian(system, exact(point.state), exact(point.control))
     dual = metric_series(metric, variable(exact(point.state[ANGLE]), 1))

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from lagros_envs.dynamics.spacecraft import HEADING, VELOCITY_X, Spacecraft
 from lagros_policies.contraction.double_integrator import AxisMetric
 from lagros_policies.contraction.statement import Statement, at_most
+from lagros_policies.contraction.systems import check_spacecraft
 
 FloatArray = NDArray[np.float64]
 
@@ -63,7 +64,11 @@ def control_square(body: Spacecraft) -> tuple[Fraction, Fraction, Fraction] | No
     Returns:
         The diagonal, exactly; None if B B' depends on the heading, is not diagonal, reaches the
         positions, or the free motion is not uniform.
+
+    Raises:
+        TypeError: The body is no spacecraft.
     """
+    check_spacecraft(body, "control_square")
     squares = [_square_at(body, tangent) for tangent in _TANGENTS]
     first = squares[0]
     if first is None or any(square != first for square in squares):
