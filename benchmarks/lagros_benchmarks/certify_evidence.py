@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 import lagros_policies
 from lagros_envs.dynamics import CartPole, System
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
+from lagros_envs.reading import MOST_TEXT, Record, named, parse_json, read_bytes
 from lagros_policies.contraction import Metric, Samples
 from lagros_policies.contraction.certificate import Certificate
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.double_integrator import AxisMetric
 from lagros_policies.contraction.held_design import HeldDesign, HeldTube, design_held_contained
-from lagros_policies.contraction.metric_files import number
+from lagros_policies.contraction.metric_files import naming
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.statement import Statement
 from lagros_policies.contraction.theorems import contraction_distance
@@ -92,22 +93,21 @@ def load_axis_metric(path: Path | None, rate: float, period: float) -> AxisMetri
 
     if path is None:
         return design_axis(rate, period)
+    data = read_bytes(path, MOST_TEXT)
     try:
-        text = path.read_bytes().decode()
+        data.decode()
     except UnicodeDecodeError as error:
         raise ValueError(
-            f"{path} is no JSON: the spacecraft's metric is one of its axes, a file with format "
-            f"{AXIS_FORMAT!r}, rate, stiffness and period; a network is not proved"
+            f"{named(path)} is no JSON: the spacecraft's metric is one of its axes, a file with "
+            f"format {AXIS_FORMAT!r}, rate, stiffness and period; a network is not proved"
         ) from error
-    try:
-        record = json.loads(text)
-        if record["format"] != AXIS_FORMAT:
-            raise ValueError(f"format {record['format']!r} is not {AXIS_FORMAT!r}")
-        names = ("rate", "stiffness", "period")
-        return AxisMetric(**{name: number(record, name) for name in names})
-    except (KeyError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
-        reason = f"it has no {error}" if isinstance(error, KeyError) else error
-        raise ValueError(f"{path} is not a metric of the spacecraft's axes: {reason}") from error
+    parsed = parse_json(data, named(path), "a metric of the spacecraft's axes")
+    record = Record(parsed, named(path))
+    record.must("format", AXIS_FORMAT)
+    names = ("rate", "stiffness", "period")
+    record.only(("format", *names))
+    with naming(path):
+        return AxisMetric(**{name: record.number(name) for name in names})
 
 
 def cartpole_tubes(system: CartPole, bound: float) -> list[ConstantTube]:

@@ -63,7 +63,9 @@ class AxisMetric:
         """Check the values."""
         check_positive("rate", self.rate)
         check_not_negative("period", self.period)
-        if not (math.isfinite(self.stiffness) and self.stiffness > self.coupling**2):
+        check_positive("stiffness", self.stiffness)
+        # A product that is too large is infinite; a power would raise.
+        if not self.stiffness > self.coupling * self.coupling:
             raise ValueError(
                 f"stiffness={self.stiffness!r} gives no positive definite W at rate={self.rate!r} "
                 f"and period={self.period!r}: see stiffness_range"

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Set
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lagros_envs.checks import check_positive
 from lagros_envs.files import write_atomic
+from lagros_envs.reading import MOST_TEXT, Record, named, parse_json, read_bytes
 from lagros_policies.contraction.metric import ContractionMetric, Metric, Region, Verification
-
-FloatArray = NDArray[np.float64]
 
 _FORMAT = "lagros-metric-1"
 _BASIS = "cos(theta)^i"
@@ -39,129 +38,55 @@ def design_record(metric: ContractionMetric) -> dict[str, Any]:
         "nu": metric.control_weight,
         "scaling": metric.scaling.tolist(),
         "region": asdict(metric.region),
-        "verification": None if metric.verification is None else asdict(metric.verification),
+        "verification": None if metric.verification is None else _check_record(metric.verification),
     }
 
 
-def design_arguments(record: Mapping[str, Any]) -> dict[str, Any]:
+def design_arguments(record: Record) -> dict[str, Any]:
     """Return the arguments of a metric from what `design_record` made.
 
     Args:
         record: The record, with any other entries.
 
     Raises:
-        KeyError: An entry is missing.
-        TypeError: An entry has a wrong type.
-        ValueError: A number is out of range, or is text or true or false.
+        ValueError: An entry is missing, of a wrong type or out of range.
     """
-    region = _entries(record, "region", {item.name for item in fields(Region)})
-    verification: Verification | None = None
-    if record["verification"] is not None:
-        check = _entries(record, "verification", {item.name for item in fields(Verification)})
-        verification = Verification(**check)
+    region = record.record("region")
+    region.only([item.name for item in fields(Region)])
+    numbers = {name: record.number(name) for name in ("alpha", "chi", "nu")}
+    for name, value in numbers.items():
+        check_positive(name, value)
     return {
-        "contraction_rate": number(record, "alpha"),
-        "condition_bound": number(record, "chi"),
-        "control_weight": number(record, "nu"),
-        "scaling": numbers(record, "scaling"),
-        "region": Region(**region),
-        "verification": verification,
+        "contraction_rate": numbers["alpha"],
+        "condition_bound": numbers["chi"],
+        "control_weight": numbers["nu"],
+        "scaling": record.array("scaling", (None,)),
+        "region": Region(**{item.name: region.number(item.name) for item in fields(Region)}),
+        "verification": None
+        if record["verification"] is None
+        else _verification(record.record("verification")),
     }
 
 
-def _entries(record: Mapping[str, Any], name: str, known: Set[str]) -> dict[str, Any]:
-    """Return an object of a JSON object, of numbers under known names."""
-    value = record[name]
-    if not isinstance(value, Mapping) or set(value) != known:
-        found = sorted(value) if isinstance(value, Mapping) else value
-        raise ValueError(f"{name}={found!r} must be an object with {', '.join(sorted(known))}")
-    only_numbers(value, name)
-    return dict(value)
+def _check_record(check: Verification) -> dict[str, Any]:
+    # JSON has no infinity, which is the worst where W_bar is no metric.
+    worst = check.worst if math.isfinite(check.worst) else None
+    return {**asdict(check), "worst": worst}
 
 
-def number(record: Mapping[str, Any], name: str) -> float:
-    """Return a number of a JSON object; text and true, which Python takes for one, are refused.
-
-    Args:
-        record: The object.
-        name: Key of the number.
-
-    Raises:
-        KeyError: There is no such key.
-        ValueError: It is no number.
-    """
-    value = record[name]
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{name}={value!r} must be a number: write it without quotes")
-    return _as_float(value, name)
-
-
-def _as_float(value: float, name: str) -> float:
-    try:
-        return float(value)
-    except OverflowError:
-        raise ValueError(f"{name} holds a whole number that is too large for a double") from None
-
-
-def numbers(record: Mapping[str, Any], name: str) -> FloatArray:
-    """Return nested lists of numbers of a JSON object as an array; see `number`.
-
-    Raises:
-        KeyError: There is no such key.
-        ValueError: An entry is no number, or the lists are of different lengths.
-    """
-    only_numbers(record[name], name)
-    try:
-        return np.array(record[name], dtype=np.float64)
-    except (ValueError, OverflowError, TypeError) as error:
-        raise ValueError(f"{name} must be lists of one length, of finite numbers") from error
-
-
-def only_numbers(value: Any, name: str) -> None:
-    """Refuse text, true, false and null anywhere inside lists and objects of JSON.
-
-    Args:
-        value: What JSON was read to.
-        name: What it is called in the message.
-
-    Raises:
-        ValueError: There is one.
-    """
-    if isinstance(value, Mapping | list):
-        for item in value.values() if isinstance(value, Mapping) else value:
-            only_numbers(item, name)
-    elif isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{name} holds {value!r}, which must be a number: write it without quotes")
-
-
-def read_text(path: Path | str) -> str:
-    """Return the text of a metric's file, which is JSON; a network is refused by name.
-
-    Args:
-        path: The file.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is a network, or no text.
-    """
-    data = Path(path).read_bytes()
-    try:
-        text = data.decode()
-    except UnicodeDecodeError:
-        text = ""
-    if Path(path).suffix == _NETWORK or (data and not text):
-        raise ValueError(
-            f"{path} is no JSON: a network is neither read nor proved here, only a polynomial is. "
-            "Give a file of save_metric, as `python -m lagros_policies.contraction.proof.design "
-            "--out FILE` writes; for networks there is load_neural_metric, and their condition is "
-            "checked on samples"
-        )
-    return text
+def _verification(record: Record) -> Verification:
+    record.only([item.name for item in fields(Verification)])
+    return Verification(
+        samples=record.whole("samples"),
+        violations=record.whole("violations"),
+        worst=math.inf if record["worst"] is None else record.number("worst"),
+        seed=record.whole("seed"),
+    )
 
 
 def save_metric(metric: Metric, path: Path | str) -> None:
     """Write a metric as JSON, atomically; numbers keep every bit."""
-    write_atomic(path, json.dumps(metric_record(metric), indent=1) + "\n")
+    write_atomic(path, json.dumps(metric_record(metric), indent=1, allow_nan=False) + "\n")
 
 
 def load_metric(path: Path | str | None = None, states: int | None = None) -> Metric:
@@ -180,17 +105,38 @@ def load_metric(path: Path | str | None = None, states: int | None = None) -> Me
     """
     if path is None:
         path = Path(__file__).parents[1] / "pretrained" / "cartpole_metric.json"
-    text = read_text(path)
-    try:
-        record = json.loads(text)
-        for name, wanted in (("format", _FORMAT), ("basis", _BASIS)):
-            if record[name] != wanted:
-                raise ValueError(f"{name} {record[name]!r} is not {wanted!r}")
-        metric = Metric(numbers(record, "coefficients"), **design_arguments(record))
+    data = read_bytes(path, MOST_TEXT)
+    if Path(path).suffix == _NETWORK or not _is_text(data):
+        raise ValueError(
+            f"{named(path)} is no JSON: a network is neither read nor proved here, only a "
+            "polynomial is. Give a file of save_metric, as `python -m "
+            "lagros_policies.contraction.proof.design --out FILE` writes; for networks there is "
+            "load_neural_metric, and their condition is checked on samples"
+        )
+    record = Record(parse_json(data, named(path), "a metric written by save_metric"), named(path))
+    record.must("format", _FORMAT)
+    record.must("basis", _BASIS)
+    with naming(path):
+        metric = Metric(record.array("coefficients"), **design_arguments(record))
         size = len(metric.scaling)
         if states not in (None, size):
-            raise ValueError(f"coefficients are of {size} states; the system has {states}")
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
-        reason = f"it has no {error}" if isinstance(error, KeyError) else error
-        raise ValueError(f"{path} is not a metric written by save_metric: {reason}") from error
+            raise ValueError(f"'coefficients' are of {size} states; the system has {states}")
     return metric
+
+
+@contextmanager
+def naming(path: Path | str) -> Iterator[None]:
+    """Put the name of a file before what is refused of its numbers, where it is not said yet."""
+    try:
+        yield
+    except (ValueError, ArithmeticError) as error:
+        text = str(error)
+        raise ValueError(text if named(path) in text else f"{named(path)}: {text}") from error
+
+
+def _is_text(data: bytes) -> bool:
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        return False
+    return True

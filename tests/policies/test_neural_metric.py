@@ -189,7 +189,7 @@ def test_file_keeps_everything(tmp_path):
     with pytest.raises(ValueError, match="damaged"):
         load_neural_metric(path)
     random_metric(1).network.save(path)
-    with pytest.raises(ValueError, match="not a metric"):
+    with pytest.raises(ValueError, match=r"not that of a metric"):
         load_neural_metric(path)
     with pytest.raises(FileNotFoundError):
         load_neural_metric(tmp_path / "none.safetensors")

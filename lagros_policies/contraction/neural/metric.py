@@ -27,12 +27,13 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import check_positive
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
+from lagros_envs.reading import Record, named, parse_json
 from lagros_policies.contraction.metric import (
     Region,
     Verification,
     at_angles,
 )
-from lagros_policies.contraction.metric_files import design_arguments, design_record
+from lagros_policies.contraction.metric_files import design_arguments, design_record, naming
 from lagros_policies.imitation.networks import Mlp
 
 FloatArray = NDArray[np.float64]
@@ -192,13 +193,9 @@ def load_neural_metric(path: Path | str | None = None) -> NeuralMetric:
     if path is None:
         path = Path(__file__).parents[2] / "pretrained" / "cartpole_neural_metric.safetensors"
     network = Mlp.load(path)
-    try:
-        record = json.loads(network.metadata["metric"])
-        if record["kind"] != _FORMAT:
-            raise ValueError(f"kind {record['kind']!r} is not {_FORMAT!r}")
+    text = network.metadata.get("metric", "")
+    name = f"the record of {named(path)}"
+    record = Record(parse_json(text, name, "that of a metric written by save_neural_metric"), name)
+    record.must("kind", _FORMAT)
+    with naming(path):
         return NeuralMetric(network, **design_arguments(record))
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
-        reason = f"it has no {error}" if isinstance(error, KeyError) else error
-        raise ValueError(
-            f"{path} is not a metric written by save_neural_metric: {reason}"
-        ) from error
