@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json as json_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
@@ -220,16 +220,43 @@ def certify_spacecraft(
 
 
 def print_certificate(found: Certificate) -> None:
-    """Print a certificate, 80 columns wide."""
+    """Print a certificate, 80 columns wide: what it comes to, its figures, every claim."""
     from rich.console import Console
     from rich.text import Text
 
     console = Console(width=_WIDTH, highlight=False)
-    console.print(Text(f"Certificate of {found.task}, policy {found.policy}"))
+    console.print(Text(f"Certificate of {found.task}, policy {found.policy}, d̄ = {found.d_bar:g}"))
+    console.print(Text(verdict(found), style="bold"))
+    console.print()
     console.print(_numbers(found))
+    console.print()
     console.print(_lines(found))
-    verdict = "every claim holds" if found.holds else "NOT every claim holds"
-    console.print(Text(f"{verdict}; evidence took {found.seconds:.1f} s"))
+    console.print(Text(f"the evidence took {found.seconds:.1f} s"))
+
+
+def verdict(found: Certificate) -> str:
+    """Return what a certificate comes to, in one sentence."""
+    from lagros_policies.contraction.statement import Kind, at_most
+
+    claims = found.statements
+    failed = sum(not line.holds for line in claims)
+    if failed or not claims:
+        return f"NOT every claim holds: {failed} of {len(claims)} do not, and come first."
+    kinds = [(sum(line.kind == kind for line in claims), kind) for kind in get_args(Kind)]
+    counted = ", ".join(f"{count} {kind}" for count, kind in kinds if count)
+    if found.task == "cartpole":
+        certified, unit = found.tube.certified, ""
+        limits = f"for a control at will, in the region, with {_CHANNELS[found.channels]}"
+        bound = f"Theorem 1 bounds the error {limits}, by"
+    else:
+        certified, unit = found.details["tubes"]["position_held_without_learning_error"], " m"
+        bound = "u*, held for 0.1 s and without learning error, is proved to stay on its plan to"
+    tube = "no tube is certified" if certified is None else f"{bound} {at_most(certified)}{unit}"
+    observed = found.tube.observed
+    flown = "nothing was flown"
+    if observed is not None:
+        flown = f"the largest error flown is {observed:.4g}{unit}"
+    return f"Every claim holds ({counted}); {tube}; {flown}."
 
 
 def _numbers(found: Certificate) -> Table:
@@ -277,7 +304,8 @@ def _lines(found: Certificate) -> Table:
     for heading in ("kind", "holds", "s"):
         table.add_column(heading, no_wrap=True, justify="right" if heading == "s" else "left")
     table.add_column("claim")
-    for line in found.statements:
+    # What does not hold first.
+    for line in sorted(found.statements, key=lambda line: line.holds):
         holds = "yes" if line.holds else "NO"
         table.add_row(line.kind, holds, f"{line.seconds:.1f}", Text(line.text))
     return table

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -38,7 +39,7 @@ def quick(monkeypatch):
 def test_the_spacecraft_is_certified_without_flights(invoke, tmp_path):
     result = invoke("spacecraft", "--episodes", "0", "--json", "out/sc.json")
     assert result.exit_code == 0, result.output
-    assert "every claim holds" in result.stdout
+    assert result.stdout.splitlines()[1].startswith("Every claim holds (8 proved, 1 observed); u*")
     assert max(cell_len(line) for line in result.stdout.splitlines()) <= 80
     record = json.loads((tmp_path / "out" / "sc.json").read_text())
     assert record["holds"]
@@ -74,8 +75,40 @@ def test_the_cartpole_is_certified_and_a_planted_bad_metric_is_not(invoke, tmp_p
             *("--json", f"{name}-certificate.json"),
         )
         assert result.exit_code == 1, result.output
-        assert "NOT every claim holds" in result.stdout
+        assert re.match(r"NOT every claim holds: \d+ of \d+ do not", result.stdout.splitlines()[1])
+        # What does not hold is seen before what does.
+        kept = re.findall(r"^ (?:proved|observed|calibrated) +(yes|NO) ", result.stdout, re.M)
+        assert kept == sorted(kept)
+        assert "NO" in kept
         assert not json.loads((tmp_path / f"{name}-certificate.json").read_text())["holds"]
+
+
+def certificate(*kinds, task="cartpole", certified=7.0, observed=None):
+    statements = tuple(Statement("claimed", kind, True, 0.0) for kind in kinds)
+    return Certificate(
+        *(task, "lagros", {"p": (-1.0, 1.0)}, 0.5, 4.0, 3.0, 1.0, 0.1, 0.75, "rates"),
+        *("1", np.zeros((1, 4, 4)), TubeSizes(3.15, certified, observed), statements),
+        {"tubes": {"position_held_without_learning_error": certified}},
+    )
+
+
+def test_the_verdict_is_one_sentence_with_what_is_proved_and_what_was_seen():
+    words = certify.verdict(certificate("proved", "proved", "observed", observed=2.0))
+    assert words == (
+        "Every claim holds (2 proved, 1 observed); Theorem 1 bounds the error for a control at "
+        "will, in the region, with the rates disturbed, not the positions, by 7; the largest error "
+        "flown is 2."
+    )
+    words = certify.verdict(certificate("calibrated", certified=None))
+    assert words == ("Every claim holds (1 calibrated); no tube is certified; nothing was flown.")
+    words = certify.verdict(certificate("proved", task="spacecraft", certified=0.31, observed=0.1))
+    assert words.endswith("stay on its plan to 0.31 m; the largest error flown is 0.1 m.")
+    failing = certificate("proved", "observed")
+    failing = replace(
+        failing, statements=(*failing.statements, Statement("no", "proved", False, 0))
+    )
+    assert certify.verdict(failing) == "NOT every claim holds: 1 of 3 do not, and come first."
+    assert certify.verdict(certificate()).startswith("NOT every claim holds: 0 of 0")
 
 
 @pytest.mark.parametrize("task", ["cartpole", "spacecraft"])
