@@ -1,13 +1,15 @@
 """Paired episodes, intervals, tables, figures and the command line `lagros`.
 
-`BenchmarkSettings` says what to run, `run_benchmark` runs it, `summarise` turns the episodes into
-the rows of the published tables. `lagros_benchmarks.cli` is the same from a terminal.
+`BenchmarkSettings` says what to run, `run_benchmark` runs it, with policies that are built by their
+names or are objects of your own, and `summarise` turns the episodes into the rows of the published
+tables. `lagros_benchmarks.cli` is the same from a terminal.
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lagros_benchmarks.episodes import EpisodeRecord, run_episode
+    from lagros_benchmarks.library import Policy
     from lagros_benchmarks.records import summarise
     from lagros_benchmarks.runner import BenchmarkRun, run_benchmark
     from lagros_benchmarks.settings import BenchmarkSettings
@@ -16,6 +18,7 @@ __all__ = [
     "BenchmarkRun",
     "BenchmarkSettings",
     "EpisodeRecord",
+    "Policy",
     "run_benchmark",
     "run_episode",
     "summarise",
@@ -25,6 +28,7 @@ _HOMES = {
     "BenchmarkRun": "runner",
     "BenchmarkSettings": "settings",
     "EpisodeRecord": "episodes",
+    "Policy": "library",
     "run_benchmark": "runner",
     "run_episode": "episodes",
     "summarise": "records",

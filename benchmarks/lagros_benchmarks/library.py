@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
@@ -203,3 +204,36 @@ class Toolbox:
     load_metric: Callable[[str | None], Callable[[FloatArray], FloatArray]] = load_metric
     make_filter: Callable[[Policy, Any, float], Policy] = make_filter
     position_margin: Callable[[Any, float], float | None] = position_margin
+
+    def with_policies(self, policies: Mapping[str, Policy]) -> Toolbox:
+        """Return the same with some policies that are objects, by name.
+
+        Args:
+            policies: Each is copied wherever one is built by its name.
+        """
+        return replace(self, make_policy=GivenPolicies(policies, self.make_policy))
+
+
+@dataclass(frozen=True)
+class GivenPolicies:
+    """Makes a policy: a copy of an object that was given, or what its name says.
+
+    Attributes:
+        objects: The policies, by name.
+        otherwise: Makes all others.
+    """
+
+    objects: Mapping[str, Policy]
+    otherwise: Callable[[str, Any, Mapping[str, Any]], Policy]
+
+    def __call__(self, name: str, env: Any, settings: Mapping[str, Any]) -> Policy:
+        """Make a policy.
+
+        Raises:
+            ValueError: There are settings for an object.
+        """
+        if name not in self.objects:
+            return self.otherwise(name, env, settings)
+        if settings:
+            raise ValueError(f"policy {name!r} is an object, which is not built with settings")
+        return deepcopy(self.objects[name])

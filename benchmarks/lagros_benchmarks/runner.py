@@ -6,7 +6,8 @@ one process runs them or many. What depends on the task is an `Experiment`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from lagros_benchmarks.cartpole_experiment import CartPoleExperiment
 from lagros_benchmarks.experiment import BenchmarkRun, Experiment
 from lagros_benchmarks.fingerprints import fingerprint
 from lagros_benchmarks.keeping import Kept
-from lagros_benchmarks.library import Toolbox
+from lagros_benchmarks.library import Policy, Toolbox
 from lagros_benchmarks.settings import BenchmarkSettings, Case
 from lagros_benchmarks.spacecraft_experiment import Scene, SpacecraftExperiment
 from lagros_benchmarks.spacecraft_experiment import fly_scene as fly_world
@@ -65,8 +66,17 @@ def run_benchmark(
     toolbox: Toolbox | None = None,
     progress: Progress | None = None,
     kept: Kept | None = None,
+    policies: Mapping[str, Policy] | None = None,
 ) -> BenchmarkRun:
     """Run every policy under every condition on the same episodes.
+
+    Policies are built by their names, or are objects of your own beside them, which are called by
+    the names that you give them in the results:
+
+        settings = BenchmarkSettings(policies=("lqr", "mine"), episodes=20)
+        run = run_benchmark(settings, policies={"mine": MyPolicy(gain=2.0)})
+        for row in summarise(run):
+            print(row["policy"], row["success_rate"])
 
     Args:
         settings: What to run.
@@ -75,15 +85,25 @@ def run_benchmark(
         kept: Has the chunks that an earlier run of the same settings has finished, and takes those
             that this one finishes; see `kept_in`. All but the times is the same with it, to the
             bit.
+        policies: Objects with the `predict` of `Policy`, by name; those that the settings do not
+            name fly after the others. Every chunk of episodes flies a copy (`copy.deepcopy`) as the
+            object is now, and worker processes are sent it by value, so that none sees what another
+            left behind, as if each were built anew.
 
     Returns:
         All episodes.
 
     Raises:
-        SetupError: A policy, the planner or the metric cannot be built. (What an episode raises is
-            recorded as its failure instead.)
+        SetupError: A policy, the planner or the metric cannot be built, or a policy cannot run.
+            (What an episode raises is recorded as its failure instead.)
+        ValueError: An object has the name of a policy of this package, or comes with `kept`, which
+            cannot tell one object from another.
         BackendError: The backend is not installed, not reachable, or loses its workers.
     """
+    if policies:
+        if kept is not None:
+            raise ValueError("kept= cannot tell policies that are objects apart; leave it out")
+        settings, toolbox = _with_policies(settings, toolbox, policies)
     experiment = make_experiment(settings, toolbox)
     cases = settings.cases
     with running(settings.backend, settings.jobs):
@@ -95,18 +115,40 @@ def run_benchmark(
     return experiment.finish(units, outcomes, timing)
 
 
-def fly_scene(settings: BenchmarkSettings, world: int = 0, toolbox: Toolbox | None = None) -> Scene:
+def fly_scene(
+    settings: BenchmarkSettings,
+    world: int = 0,
+    toolbox: Toolbox | None = None,
+    policies: Mapping[str, Policy] | None = None,
+) -> Scene:
     """Fly one world of a spacecraft benchmark again and keep where everybody was.
 
     Args:
         settings: Those of the run.
         world: Which of its worlds, from 0.
         toolbox: As for `run_benchmark`.
+        policies: As for `run_benchmark`.
 
     Raises:
         ValueError: The run has no such world.
     """
+    if policies:
+        settings, toolbox = _with_policies(settings, toolbox, policies)
     return fly_world(settings, world, toolbox or Toolbox())
+
+
+def _with_policies(
+    settings: BenchmarkSettings, toolbox: Toolbox | None, policies: Mapping[str, Policy]
+) -> tuple[BenchmarkSettings, Toolbox]:
+    """Return settings that name all policies and a toolbox that makes them."""
+    from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
+
+    taken = NAMES if settings.task == "cartpole" else SPACECRAFT_NAMES
+    for name in policies:
+        if name in taken:
+            raise ValueError(f"policies: {name!r} is a policy of this package; take another name")
+    names = dict.fromkeys((*settings.policies, *policies))
+    return replace(settings, policies=tuple(names)), (toolbox or Toolbox()).with_policies(policies)
 
 
 def _play_cases(
