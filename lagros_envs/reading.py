@@ -45,26 +45,48 @@ def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:
         ValueError: It is no regular file (a folder, a pipe, a device), is too large, or cannot be
             read.
     """
+    name = check_file(path, most)
+    try:
+        with Path(path).open("rb") as stream:
+            # What states no size, as under /proc, ends here.
+            data = stream.read(most + 1)
+    except OSError as error:
+        raise ValueError(f"{name} cannot be read: {error.strerror}") from None
+    if len(data) > most:
+        raise ValueError(_too_large(name, most))
+    return data
+
+
+def check_file(path: str | Path, most: int = MOST_BYTES) -> str:
+    """Check, before a library opens it, that a path is a file which can be read at once.
+
+    Args:
+        path: The file; a link is followed.
+        most: A larger one is refused [bytes].
+
+    Returns:
+        How messages name it.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no regular file (a folder, a pipe, a device) or too large.
+    """
     name = named(path)
     try:
         found = Path(path).stat()
-        if not stat.S_ISREG(found.st_mode):
-            kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe, a device or a socket"
-            raise ValueError(f"{name} is {kind}, not a file; write what it gives to a file first")
-        with Path(path).open("rb") as stream:
-            data = stream.read(most + 1)
     except FileNotFoundError:
         raise FileNotFoundError(f"there is no file {name}") from None
     except OSError as error:
         raise ValueError(f"{name} cannot be read: {error.strerror}") from None
     except ValueError as error:
         # A name with a null byte.
-        raise ValueError(str(error) if name in str(error) else f"{name}: {error}") from None
-    if len(data) > most:
-        raise ValueError(
-            f"{name} has more than the {most} bytes that are read; is it the right one?"
-        )
-    return data
+        raise ValueError(f"{name}: {error}") from None
+    if not stat.S_ISREG(found.st_mode):
+        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe, a device or a socket"
+        raise ValueError(f"{name} is {kind}, not a file; write what it gives to a file first")
+    if found.st_size > most:
+        raise ValueError(_too_large(name, most))
+    return name
 
 
 def read_json(path: str | Path, what: str = "JSON") -> Any:
@@ -82,13 +104,14 @@ def read_json(path: str | Path, what: str = "JSON") -> Any:
     return parse_json(read_bytes(path, MOST_TEXT), named(path), what)
 
 
-def parse_json(data: bytes | str, name: str, what: str = "JSON") -> Any:
+def parse_json(data: bytes | str, name: str, what: str = "JSON", all_finite: bool = True) -> Any:
     """Read a value from the bytes or text of JSON; see `read_json`.
 
     Args:
         data: The JSON.
         name: Where it is from, for the message.
         what: What it should hold, for the message.
+        all_finite: Whether NaN and infinities, which Python writes, are refused.
 
     Raises:
         ValueError: As for `read_json`.
@@ -105,7 +128,7 @@ def parse_json(data: bytes | str, name: str, what: str = "JSON") -> Any:
             parse_constant=partial(_finite, strange),
             object_pairs_hook=_object,
         )
-        if strange:
+        if strange and all_finite:
             raise ValueError(f"{_not_finite(value)} is a number that is not finite or too large")
     except RecursionError:
         reason = "it is nested too deeply"
@@ -306,6 +329,10 @@ def named(path: str | Path) -> str:
     """Return a path as messages name it: on one line, in letters that can be printed."""
     text = str(path)
     return text if text.isprintable() and text and text == text.strip() else repr(text)
+
+
+def _too_large(name: str, most: int) -> str:
+    return f"{name} has more than the {most} bytes that are read; is it the right file?"
 
 
 def _stranger(value: Any) -> tuple[Any] | None:

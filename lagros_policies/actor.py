@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
-from lagros_envs.checks import check_positive
+from lagros_envs.checks import check_positive, shown
 from lagros_policies.imitation.networks import Mlp, read_safetensors, write_safetensors
 from lagros_policies.trained_for import KEYS, cartpole_range, check_trained_for
 
@@ -125,7 +125,7 @@ class Actor:
         known = metadata.get("format") in (_FORMAT, _CLIPPED_FORMAT)
         if not known or metadata.get("activation") != "tanh":
             raise ValueError(
-                f"{path} is not an actor of this package: its metadata say {metadata!r}"
+                f"{path} is not an actor of this package: its metadata say {shown(metadata)}"
             )
         layers = sum(name.endswith(".weight") for name in tensors)
         squash: Any = "clip" if metadata["format"] == _CLIPPED_FORMAT else metadata.get("squash")

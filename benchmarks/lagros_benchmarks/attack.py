@@ -6,6 +6,7 @@ Only the standard library, typer and `terminal` are imported here; the command i
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +14,7 @@ import typer
 
 from lagros_benchmarks.extras import check_extra
 from lagros_benchmarks.outputs import Delivery, check_outputs, policy_files
-from lagros_benchmarks.terminal import fail, find_users_modules
+from lagros_benchmarks.terminal import fail, find_users_modules, options_given, refuse_options
 
 if TYPE_CHECKING:
     from lagros_benchmarks.worst_case.attack import AttackSettings
@@ -86,6 +87,10 @@ def attack(
     find_users_modules([policy])
     try:
         if replay is not None:
+            refuse_options(
+                options_given(but=("--replay", "--policy")),
+                "--replay flies what the file says",
+            )
             _replay(task, policy, replay)
             return
         settings = _settings(task, policy, goal, bound, episodes, budget, seed, method)
@@ -95,8 +100,6 @@ def attack(
             settings = replace(settings, safety_filter=True)
         check_outputs({"--json": json, "--npz": npz}, policy_files([policy]))
         _search(settings, json, npz)
-    except FileNotFoundError as error:
-        fail(f"there is no file {error.filename}; --npz of an earlier attack writes one")
     except (ValueError, OSError) as error:
         fail(error)
     except (ImportError, SetupError) as error:
@@ -159,27 +162,46 @@ def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> No
 
 
 def _replay(task: str, policy: str, path: Path) -> None:
+    from lagros_benchmarks.settings import check_task
     from lagros_benchmarks.worst_case.attack import fly_again
     from lagros_benchmarks.worst_case.replay import load_worst_cases
-    from lagros_policies.naming import is_code
 
-    cases = load_worst_cases(path)
-    if cases.command.get("task") != task:
-        raise ValueError(f"{path} is of the task {cases.command.get('task')!r}, not {task!r}")
-    flown = str(cases.command.get("policy"))
-    if is_code(flown) and flown != policy:
-        raise ValueError(
-            f"{path} was found against {flown!r}, which is code of somebody's: name it, too, with "
-            f"--policy {flown}, if you trust it"
-        )
+    check_task(task)
+    try:
+        cases = load_worst_cases(path)
+        _check_command(cases.command, task, policy)
+        flown = fly_again(cases)
+    except FileNotFoundError as error:
+        raise ValueError(f"--replay: {error}; --npz of an earlier attack writes one") from None
+    except ValueError as error:
+        text = str(error)
+        raise ValueError(f"--replay: {text if str(path) in text else f'{path}: {text}'}") from None
     differing = 0
-    for before, now in zip(cases.outcomes, fly_again(cases), strict=True):
+    for before, now in zip(cases.outcomes, flown, strict=True):
         same = before == now
         differing += not same
         typer.echo(f"{_line(now)}: {'as stored' if same else f'differs, stored {_line(before)}'}")
     if differing:
         typer.echo(f"lagros: {differing} of {len(cases.outcomes)} differ", err=True)
         raise typer.Exit(1)
+
+
+def _check_command(command: Mapping[str, Any], task: str, policy: str) -> None:
+    """Check what a file says that it was made with against what was asked for.
+
+    Raises:
+        ValueError: It is of another task, or of a policy that is code and was not asked for.
+    """
+    from lagros_policies.naming import is_code
+
+    if command.get("task") != task:
+        raise ValueError(f"it is of the task {command.get('task')!r}, not {task!r}")
+    its = str(command.get("policy"))
+    if is_code(its) and its != policy:
+        raise ValueError(
+            f"it was found against {its!r}, which is code of somebody's: name it, too, with "
+            f"--policy {its}, if you trust it"
+        )
 
 
 def _line(outcome: Outcome) -> str:

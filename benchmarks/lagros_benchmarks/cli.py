@@ -22,6 +22,7 @@ from lagros_benchmarks.outputs import policy_files
 from lagros_benchmarks.streams import printing_failed
 from lagros_benchmarks.terminal import (
     INTERRUPTED,
+    Command,
     Commands,
     fail,
     find_users_modules,
@@ -76,7 +77,7 @@ def main(
         raise typer.Exit
 
 
-@app.command()
+@app.command(cls=Command)
 def bench(
     task: Annotated[str, typer.Argument(help="cartpole, or spacecraft.")],
     policies: Annotated[
@@ -201,7 +202,7 @@ def bench(
     run_and_report(settings, outputs, out or BENCH_FOLDER, keep=out is not None)
 
 
-@app.command()
+@app.command(cls=Command)
 def demo() -> None:
     """The paper's cart-pole experiment: 50 paired episodes, the table and the figure."""
     from lagros_benchmarks.report import Outputs
@@ -215,7 +216,7 @@ def demo() -> None:
     run_and_report(BenchmarkSettings(**DEMO), outputs, DEMO_FOLDER)
 
 
-@app.command()
+@app.command(cls=Command)
 def reproduce(
     task: Annotated[str, typer.Argument(help="cartpole or spacecraft.")],
     folder: Annotated[
@@ -287,11 +288,11 @@ def _reproduced(task: str, folder: Path) -> Outputs:
     )
 
 
-app.command()(watch)
-app.command()(export)
-app.command()(certify)
-app.command()(train)
-app.command()(attack)
+app.command(cls=Command)(watch)
+app.command(cls=Command)(export)
+app.command(cls=Command)(certify)
+app.command(cls=Command)(train)
+app.command(cls=Command)(attack)
 app.add_typer(data, name="data")
 
 

@@ -20,7 +20,7 @@ import typer
 
 from lagros_benchmarks.extras import check_extra
 from lagros_benchmarks.outputs import Delivery, check_outputs
-from lagros_benchmarks.terminal import fail, progress_bar
+from lagros_benchmarks.terminal import Command, fail, progress_bar
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -42,7 +42,7 @@ def main() -> None:
     """Expert data for other libraries."""
 
 
-@data.command()
+@data.command(cls=Command)
 def export(
     minari: Annotated[bool, typer.Option("--minari", help="Write a Minari dataset.")] = False,
     task: Annotated[str, typer.Option(help="cartpole, or spacecraft (one agent).")] = "cartpole",

@@ -6,13 +6,15 @@ Only the standard library, typer, `extras` and `streams` are imported here.
 from __future__ import annotations
 
 import os
+import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from lagros_benchmarks.extras import install_hint
 from lagros_benchmarks.streams import patient_streams
@@ -25,15 +27,91 @@ USAGE_ERROR = 2
 INTERRUPTED = 130
 
 Value = TypeVar("Value")
+# The command that runs.
+_CONTEXT: ContextVar[Any] = ContextVar("context", default=None)
+# How the settings begin a message on one of their fields.
+_FIELD = re.compile(r"(\w+)=|unknown ([\w ]+?) ['\"]|(\w+) must not be empty")
+_SHOWN = 60  # letters of an entry in a message
 
 
 def fail(error: Exception | str, status: int = USAGE_ERROR) -> NoReturn:
     """Say what is wrong, without a traceback, and end with the exit status."""
-    text = str(error)
+    text = _named_by_option(str(error))
     if isinstance(error, Exception) and "pip install" not in text:
         text += install_hint(error)
     typer.echo(f"lagros: {text}", err=True)
     raise typer.Exit(status)
+
+
+class Command(TyperCommand):
+    """A command that is known, while it runs, to what is said of its options."""
+
+    def invoke(self, context: Any) -> Any:
+        """Run it."""
+        token = _CONTEXT.set(context)
+        try:
+            return super().invoke(context)
+        finally:
+            _CONTEXT.reset(token)
+
+
+def options_given(but: Collection[str] = ()) -> list[str]:
+    """Return the options that stand on the command line, such as "--bound".
+
+    Args:
+        but: Options that are not asked for.
+    """
+    context = _CONTEXT.get()
+    if context is None:
+        return []
+    return [
+        option
+        for option, name in _options(context).items()
+        if option not in but and context.get_parameter_source(name).name == "COMMANDLINE"
+    ]
+
+
+def refuse_options(given: Collection[str], why: str) -> None:
+    """Refuse options that would do nothing, of those that stand on the command line.
+
+    Args:
+        given: The options.
+        why: What makes them idle, for the message.
+
+    Raises:
+        ValueError: One stands there.
+    """
+    idle = [option for option in options_given() if option in given]
+    if idle:
+        raise ValueError(f"{', '.join(idle)}: {why}; leave it out")
+
+
+def _options(context: Any) -> dict[str, str]:
+    """Return the parameters' names by their options."""
+    return {
+        parameter.opts[0]: parameter.name
+        for parameter in context.command.params
+        if parameter.opts[0].startswith("--")
+    }
+
+
+def _named_by_option(text: str) -> str:
+    """Put the option before a message of the settings, which know the field but not the option."""
+    context = _CONTEXT.get()
+    said = _FIELD.match(text)
+    if context is None or said is None:
+        return text
+    field = next(filter(None, said.groups()))
+    for option, name in _options(context).items():
+        if _stem(name) == _stem(field) and option not in text:
+            return f"{option}: {text}"
+    return text
+
+
+def _stem(name: str) -> str:
+    """Return a name of a field or an option in one number and spelling."""
+    plain = name.replace(" ", "_").removeprefix("num_")
+    return f"{plain[:-3]}y" if plain.endswith("ies") else plain.removesuffix("s")
 
 
 class Commands(TyperGroup):
@@ -75,15 +153,18 @@ def listed(text: str, convert: Callable[[str], Value], option: str) -> tuple[Val
     """Split a comma-separated option.
 
     Raises:
-        ValueError: An entry cannot be converted.
+        ValueError: An entry is empty, or cannot be converted.
     """
     values = []
-    for entry in filter(None, (part.strip() for part in text.split(","))):
+    for entry in (part.strip() for part in text.split(",")):
+        shown = repr(entry if len(entry) <= _SHOWN else f"{entry[:_SHOWN]}…")
+        if not entry:
+            raise ValueError(f"{option}: an entry is empty; write them as a,b without a comma more")
         try:
             values.append(convert(entry))
         except ValueError:
             kind = "a whole number" if convert is int else "a number"
-            raise ValueError(f"{option}: {entry!r} is not {kind}") from None
+            raise ValueError(f"{option}: {shown} is not {kind}") from None
     return tuple(values)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lagros_envs.checks import shown
 from lagros_policies.imitation.networks import read_safetensors, write_safetensors
 
 if TYPE_CHECKING:
@@ -67,6 +68,11 @@ def load_progress(
     tensors, metadata = read_safetensors(path)
     if metadata.get("fingerprint") != fingerprint:
         raise ValueError(f"{path} belongs to other settings or data; remove it to start anew")
+    if _shapes(parameters) != {name: tensor.shape for name, tensor in tensors.items()}:
+        raise ValueError(f"{path} holds another network; remove it to start anew")
+    epoch = metadata.get("epoch", "")
+    if not epoch.isdecimal():
+        raise ValueError(f"{path} is damaged: epoch={shown(epoch)}; remove it to start anew")
     with torch.no_grad():
         for index, parameter in enumerate(parameters):
             parameter.copy_(torch.from_numpy(tensors[f"{index}.value"]))
@@ -75,4 +81,13 @@ def load_progress(
                 "exp_avg": torch.from_numpy(tensors[f"{index}.mean"].copy()),
                 "exp_avg_sq": torch.from_numpy(tensors[f"{index}.square"].copy()),
             }
-    return int(metadata["epoch"])
+    return int(epoch)
+
+
+def _shapes(parameters: Sequence[torch.nn.Parameter]) -> dict[str, tuple[int, ...]]:
+    shapes: dict[str, tuple[int, ...]] = {}
+    for index, parameter in enumerate(parameters):
+        for part in ("value", "mean", "square"):
+            shapes[f"{index}.{part}"] = tuple(parameter.shape)
+        shapes[f"{index}.step"] = (1,)
+    return shapes

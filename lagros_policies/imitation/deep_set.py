@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import shown
 from lagros_policies.imitation.networks import read_safetensors, write_safetensors
 from lagros_policies.imitation.spacecraft_features import (
     NEIGHBOUR,
@@ -123,7 +124,7 @@ class DeepSet:
         tensors, metadata = read_safetensors(path)
         if metadata.get("format") != _FORMAT:
             raise ValueError(
-                f"{path} is not a deep set of this package: its metadata say {metadata!r}"
+                f"{path} is not a deep set of this package: its metadata say {shown(metadata)}"
             )
         counts = [sum(name.startswith(part) for name in tensors) // 2 for part in _PARTS]
         names = [
@@ -131,7 +132,9 @@ class DeepSet:
             for part, count in zip(_PARTS, counts, strict=True)
         ]
         if sorted(tensors) != sorted(name for part in names for layer in part for name in layer):
-            raise ValueError(f"{path} holds the tensors {sorted(tensors)}, which are no layers")
+            raise ValueError(
+                f"{path} holds the tensors {shown(sorted(tensors))}, which are no layers"
+            )
         layers = [[(tensors[weight], tensors[bias]) for weight, bias in part] for part in names]
         try:
             return cls(layers[0], layers[1], layers[2], metadata)

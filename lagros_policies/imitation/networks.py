@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import shown
 from lagros_envs.files import write_atomic
+from lagros_envs.reading import check_file
 
 Float32Array = NDArray[np.float32]
 
@@ -116,12 +118,14 @@ class Mlp:
         tensors, metadata = read_safetensors(path)
         if metadata.get("format") != _FORMAT or metadata.get("activation") != "tanh":
             raise ValueError(
-                f"{path} is not a network of this package: its metadata say {metadata!r}"
+                f"{path} is not a network of this package: its metadata say {shown(metadata)}"
             )
         layers = range(len(tensors) // 2)
         names = [f"layer{index}.{part}" for index in layers for part in ("weight", "bias")]
         if sorted(names) != sorted(tensors):
-            raise ValueError(f"{path} holds the tensors {sorted(tensors)}, which are no layers")
+            raise ValueError(
+                f"{path} holds the tensors {shown(sorted(tensors))}, which are no layers"
+            )
         try:
             return cls(
                 [tensors[name] for name in names[0::2]],
@@ -156,23 +160,31 @@ def read_safetensors(path: Path | str) -> tuple[dict[str, Float32Array], dict[st
         FileNotFoundError: There is no such file.
         ValueError: The file is truncated, not safetensors, or not as it was written.
     """
-    from safetensors import SafetensorError, safe_open
+    from safetensors import safe_open
 
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"there is no weight file {path}")
+    name = check_file(path)
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = dict(file.metadata() or {})
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError) as error:
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except Exception as error:
+        # Besides its own error, the library raises what NumPy says of a type that it lacks.
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise ValueError(
-            f"{path} is damaged or not a safetensors file ({error}); fetch or train it again"
-        ) from error
+            f"{name} is damaged or not a safetensors file ({reason}); fetch or train it again"
+        ) from None
     # The format itself does not notice a changed weight.
     stated = metadata.pop(_CHECKSUM, None)
     if stated is not None and stated != _checksum(tensors, metadata):
-        raise ValueError(f"{path} is damaged: its checksum is wrong; fetch or train it again")
-    return tensors, metadata
+        raise ValueError(f"{name} is damaged: its checksum is wrong; fetch or train it again")
+    for key, tensor in tensors.items():
+        if tensor.dtype.kind != "f" or not tensor.size:
+            raise ValueError(
+                f"{name}: {shown(key)} is {tensor.dtype} of shape {tensor.shape} and must be "
+                "floating-point numbers, one at least"
+            )
+    with np.errstate(over="ignore"):  # what overflows is found not to be finite
+        return {key: tensor.astype(np.float32) for key, tensor in tensors.items()}, metadata
 
 
 def _checksum(tensors: dict[str, Float32Array], metadata: dict[str, str]) -> str:

@@ -41,7 +41,7 @@ def faked(monkeypatch):
         (("cartpol",), "unknown task 'cartpol'. Did you mean 'cartpole'?"),
         (("cartpole", "--policies", "lagors,lqr"), "Did you mean 'lagros'? Valid: learned,"),
         (("cartpole", "--policies", "ppo2.zip"), "there is no file 'ppo2.zip'"),
-        (("cartpole", "--policies", ","), "policies must not be empty"),
+        (("cartpole", "--policies", ","), "--policies: an entry is empty"),
         (("cartpole", "--disturbance", "gusts"), "Did you mean 'gust'? Valid: none, uniform,"),
         (("cartpole", "--bound", "0.1,much"), "--bound: 'much' is not a number"),
         (("cartpole", "--bound", "-1"), "must be finite and >= 0"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from time import perf_counter
 from typing import Any, cast
 
@@ -48,9 +48,10 @@ from lagros_benchmarks.worst_case.spacecraft import (
     SpacecraftTarget,
     first_adversaries,
 )
-from lagros_envs import spacecraft_task
+from lagros_envs import cartpole_task, spacecraft_task
 from lagros_envs.checks import check_fields, check_name, check_positive, check_seed, check_whole
 from lagros_envs.disturbances import Disturbance
+from lagros_envs.reading import Record
 from lagros_envs.scenarios import MOST_AGENTS, PRESETS
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
@@ -160,6 +161,7 @@ def fly_again(cases: WorstCases) -> list[Outcome]:
     """
     settings = settings_from(cases.command)
     check_bound(cases.pushes, settings.bound)
+    check_shape(cases.pushes, settings)
     if settings.task == "cartpole":
         bench = _CartPoleBench(settings)
         found = bench.replay(cases.pushes)
@@ -177,11 +179,33 @@ def settings_from(command: Any) -> AttackSettings:
     Raises:
         ValueError: They are not such settings.
     """
-    try:
-        given = dict(command)
-        return AttackSettings(**{**given, "search": SearchSettings(**given["search"])})
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"the file names no attack of this version: {error}") from error
+    given = Record(command, "'command'")
+    searched = given.record("search")
+    given.only([item.name for item in fields(AttackSettings)])
+    searched.only([item.name for item in fields(SearchSettings)])
+    return AttackSettings(**{**given.entries, "search": SearchSettings(**searched.entries)})
+
+
+def check_shape(pushes: FloatArray, settings: AttackSettings) -> None:
+    """Check that there is a push for every episode, step and state of an attack.
+
+    Raises:
+        ValueError: There are more or fewer.
+    """
+    one = (
+        (cartpole_task.CartPoleSettings().steps, cartpole_task.STATE_DIM)
+        if settings.task == "cartpole"
+        else (
+            spacecraft_task.SpacecraftSettings().steps,
+            settings.agents,
+            spacecraft_task.STATE_DIM,
+        )
+    )
+    if pushes.shape != (settings.episodes, *one):
+        raise ValueError(
+            f"'pushes' has the shape {pushes.shape} and must have {(settings.episodes, *one)} for "
+            f"episodes={settings.episodes} of {settings.task}"
+        )
 
 
 def check_bound(pushes: FloatArray, bound: float) -> None:

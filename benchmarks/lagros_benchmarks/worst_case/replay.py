@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -28,12 +27,16 @@ from lagros_benchmarks.worst_case.cartpole import Episodes, Flights, scores
 from lagros_benchmarks.worst_case.sequences import Replay
 from lagros_benchmarks.worst_case.spacecraft import SpacecraftTarget
 from lagros_envs import cartpole_task as task
+from lagros_envs.checks import is_number, shown
 from lagros_envs.files import write_atomic
+from lagros_envs.reading import Record, named, parse_json, read_npz
 from lagros_envs.spacecraft_task import SpacecraftSettings
 
 FloatArray = NDArray[np.float64]
 
 _FORMAT = "lagros-worst-case-1"
+# Of all sequences together: a thousand worlds of eight agents have less.
+_MOST_BYTES = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -193,32 +196,43 @@ def load_worst_cases(path: Path | str) -> WorstCases:
         FileNotFoundError: There is no such file.
         ValueError: It is no such file, or damaged.
     """
-    data = Path(path).read_bytes()
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            pushes, text = np.array(arrays["pushes"], np.float64), str(arrays["record"])
-        record = json.loads(text)
-        if record["format"] != _FORMAT:
-            raise ValueError(f"format {record['format']!r} is not {_FORMAT!r}")
-        outcomes = tuple(_outcome(entry) for entry in record["outcomes"])
-        if pushes.ndim not in (3, 4) or len(pushes) != len(outcomes):
-            raise ValueError(f"{len(outcomes)} outcomes do not match pushes {pushes.shape}")
-        return WorstCases(record["command"], pushes, outcomes)
-    except (
-        AttributeError,
-        KeyError,
-        TypeError,
-        ValueError,
-        EOFError,
-        zipfile.BadZipFile,
-    ) as error:
-        raise ValueError(f"{path} is not a file of `lagros attack --npz`: {error}") from error
+    arrays = read_npz(path, ("pushes", "record"), _MOST_BYTES)
+    name = named(path)
+    text, pushes = arrays["record"], arrays["pushes"]
+    if text.dtype.kind != "U" or text.ndim:
+        raise ValueError(f"{name} is not a file of `lagros attack --npz`: 'record' is no text")
+    # The score of a flight that raised is infinite.
+    record = Record(parse_json(str(text), f"{name}: 'record'", all_finite=False), name)
+    record.must("format", _FORMAT)
+    if pushes.dtype.kind != "f" or pushes.ndim not in (3, 4) or not np.all(np.isfinite(pushes)):
+        raise ValueError(
+            f"{name}: 'pushes' of shape {pushes.shape} and type {pushes.dtype} must be finite "
+            "numbers of shape (episodes, steps, 4) or (episodes, steps, agents, 6)"
+        )
+    entries = record.list("outcomes")
+    if len(entries) != len(pushes):
+        raise ValueError(f"{name}: {len(entries)} 'outcomes' do not match pushes {pushes.shape}")
+    outcomes = tuple(
+        _outcome(Record(entry, f"{name}: outcome {index}")) for index, entry in enumerate(entries)
+    )
+    return WorstCases(record.record("command").entries, pushes.astype(np.float64), outcomes)
 
 
-def _outcome(entry: Mapping[str, Any]) -> Outcome:
-    """Return a stored outcome without what files of earlier versions called certified."""
+def _outcome(entry: Record) -> Outcome:
+    """Return what a file says of one sequence, without what earlier versions called certified.
+
+    Raises:
+        ValueError: An entry is missing or of another type.
+    """
+    score, broken, error = entry["score"], entry["broken"], entry["error"]
+    if not is_number(score):
+        raise ValueError(f"{entry.name}: 'score' is {shown(score)} and must be a number")
+    if not isinstance(broken, bool):
+        raise ValueError(f"{entry.name}: 'broken' is {shown(broken)} and must be true or false")
+    if not isinstance(error, str | None):
+        raise ValueError(f"{entry.name}: 'error' is {shown(error)} and must be text or null")
     measures = {
         name: None if name.startswith("certified") else value
-        for name, value in entry["measures"].items()
+        for name, value in entry.record("measures").entries.items()
     }
-    return Outcome(**{**entry, "measures": measures})
+    return Outcome(entry.whole("seed"), float(score), broken, measures, error)
