@@ -125,7 +125,7 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
                 f"render_mode={render_mode!r}: the vector environment does not draw; use {drawn_by}"
             )
         check_step_limit(max_episode_steps, settings)
-        self.step_limit = min(settings.steps, max_episode_steps or settings.steps)
+        self._step_limit = min(settings.steps, max_episode_steps or settings.steps)
         self.num_envs, self.num_worlds = num_envs, num_worlds
         self.single_observation_space = single_observation_space
         self.single_action_space = single_action_space
@@ -140,6 +140,11 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
         self._started = False
         # Of the episodes of all worlds, where nothing starts them anew.
         self._end = End.NOT_YET
+
+    @property
+    def step_limit(self) -> int:
+        """Control steps after which an episode is truncated."""
+        return self._step_limit
 
     @abstractmethod
     def _start(self, worlds: IntArray, seeds: Sequence[int], given: dict[str, Any]) -> None:

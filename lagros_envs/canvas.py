@@ -59,7 +59,9 @@ def mix(colour: Colour, share: float) -> Colour:
 class Canvas:
     """An enlarged canvas, its window, and strokes in the pixels of the canvas.
 
-    Only the mode "human" opens a window; "rgb_array" needs no display.
+    Only the mode "human" opens a window; "rgb_array" needs no display. pygame has one window in a
+    process: who draws in it last has opened it anew. A copy, or one that was pickled, prepares what
+    it needs of pygame when it draws.
 
     Args:
         render_mode: "human" or "rgb_array".
@@ -81,24 +83,50 @@ class Canvas:
         fonts: tuple[int, ...],
     ) -> None:
         """Prepare a canvas, and a window in the mode "human"."""
+        self._seen = render_mode == "human"
+        self._fps, self._size, self._caption, self._heights = fps, size, caption, fonts
+        self._prepare()
+
+    def _prepare(self) -> None:
         library = self._pygame = import_pygame()
-        self._fps, self._size = fps, size
         self._window: pygame.Surface | None = None
-        self._clock: pygame.time.Clock | None = None
-        library.font.init()
-        self._fonts = {height: library.font.Font(None, height * OVERSAMPLING) for height in fonts}
-        self._canvas = library.Surface((size[0] * OVERSAMPLING, size[1] * OVERSAMPLING))
-        if render_mode == "human":
-            library.display.init()
-            self._window = library.display.set_mode(size)
-            library.display.set_caption(caption)
-            self._clock = library.time.Clock()
+        self._clock = library.time.Clock()
+        self._make_fonts()
+        width, height = self._size
+        self._canvas = library.Surface((width * OVERSAMPLING, height * OVERSAMPLING))
+        if self._seen:
+            self._open()
+
+    def _make_fonts(self) -> None:
+        fonts = self._pygame.font
+        fonts.init()
+        self._fonts = {height: fonts.Font(None, height * OVERSAMPLING) for height in self._heights}
+
+    def _open(self) -> None:
+        display = self._pygame.display
+        display.init()
+        self._window = display.set_mode(self._size)
+        display.set_caption(self._caption)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what belongs to pygame, which cannot be copied."""
+        own = {"_pygame", "_window", "_clock", "_fonts", "_canvas"}
+        return {name: value for name, value in self.__dict__.items() if name not in own}
 
     def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._window is not None:
+        """Close the window, if it is ours."""
+        if self._window is not None and self._pygame.display.get_surface() is self._window:
             self._pygame.display.quit()
-            self._window = None
+        self._window = None
+
+    def _clear(self) -> None:
+        """Begin a frame."""
+        if not hasattr(self, "_pygame"):
+            self._prepare()
+        # Someone else may have opened a window, or closed all of pygame.
+        if self._seen and self._pygame.display.get_surface() is not self._window:
+            self._open()
+        self._canvas.fill(WHITE)
 
     def _shown(self) -> NDArray[np.uint8] | None:
         """Show what was drawn: in the window, or as the frame (height, width, 3) without one."""
@@ -110,8 +138,7 @@ class Canvas:
         self._window.blit(frame, (0, 0))
         pygame.event.pump()
         pygame.display.flip()
-        if self._clock is not None:
-            self._clock.tick(self._fps)
+        self._clock.tick(self._fps)
         return None
 
     def _line(self, start: Point, end: Point, colour: Colour, width: float) -> None:
@@ -158,6 +185,11 @@ class Canvas:
         self._pygame.draw.polygon(self._canvas, colour, corners)
 
     def _text(self, text: str, place: Point, colour: Colour, size: int, anchor: str) -> None:
-        image = self._fonts[size].render(text, True, colour)
+        try:
+            image = self._fonts[size].render(text, True, colour)
+        except self._pygame.error:
+            # Someone has closed pygame's fonts, as Gymnasium's environments do with all of it.
+            self._make_fonts()
+            image = self._fonts[size].render(text, True, colour)
         position: dict[str, Any] = {anchor: (round(place[0]), round(place[1]))}
         self._canvas.blit(image, image.get_rect(**position))

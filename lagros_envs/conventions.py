@@ -52,6 +52,11 @@ class Conforming:
     settings: LimitedSettings
     _spec: EnvSpec | None = None
 
+    @property
+    def step_limit(self) -> int:
+        """Control steps after which an episode is truncated."""
+        return self.settings.steps
+
     def __copy__(self) -> Self:
         """Return a copy that shares nothing: one that shared arrays would step both."""
         return copy.deepcopy(self)
@@ -70,7 +75,8 @@ class Conforming:
         """
         if value is not None:
             check_step_limit(_limit_from_make(), self.settings)
-            value = replace(value, kwargs=plain(value.kwargs))
+            # The environment truncates by itself, with Gymnasium's wrapper around it or without.
+            value = replace(value, kwargs=plain(value.kwargs), max_episode_steps=self.step_limit)
         self._spec = value
 
 

@@ -19,7 +19,6 @@ from lagros_envs.canvas import (
     PURPLE,
     SKY_BLUE,
     VERMILLION,
-    WHITE,
     Canvas,
     Colour,
     Point,
@@ -97,7 +96,7 @@ class CartPoleRenderer(Canvas):
         )
         self._centre = 0.5 * (left + right)
         distance = float(np.linalg.norm(state - goal))
-        self._canvas.fill(WHITE)
+        self._clear()
         # The tube is a ball in the whole state. At the angle and rates of x it reaches so far in p.
         others = float(np.linalg.norm(state[1:] - goal[1:]))
         reach = math.sqrt(max(0.0, tube_radius**2 - others**2))

@@ -90,7 +90,7 @@ class SpacecraftRenderer(Canvas):
             self._trail.pop()
         self._trail.append((time, positions))
         self._fit(world)
-        self._canvas.fill(WHITE)
+        self._clear()
         self._draw_arena()
         self._draw_sensing(world)
         self._draw_planned_tubes(world)
