@@ -19,6 +19,7 @@ from lagros_envs.checks import check_fields, check_multiple, check_not_negative,
 from lagros_envs.dynamics import CartPole
 from lagros_envs.options import nominal_option, option_numbers
 from lagros_envs.tube import PaperTube
+from lagros_envs.values import ByValue
 
 FloatArray = NDArray[np.float64]
 
@@ -97,8 +98,8 @@ class CartPoleSettings:
         return round(self.time_limit / self.control_period)
 
 
-@dataclass(frozen=True)
-class CartPoleScenario:
+@dataclass(frozen=True, eq=False)
+class CartPoleScenario(ByValue):
     """What an episode asks for, or each of several episodes.
 
     Attributes:
@@ -108,6 +109,10 @@ class CartPoleScenario:
 
     initial_state: FloatArray
     goal: FloatArray
+
+    def __post_init__(self) -> None:
+        """Make the arrays read-only."""
+        self._lock()
 
 
 def sample_scenario(rng: np.random.Generator, settings: CartPoleSettings) -> CartPoleScenario:

@@ -11,12 +11,14 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_not_negative
+from lagros_envs.checks import check_not_negative, shown, suggestion
+from lagros_envs.options import real_numbers
+from lagros_envs.values import ByValue
 
 FloatArray = NDArray[np.float64]
 
@@ -179,8 +181,8 @@ OPEN_LOOP: dict[str, OpenLoop] = {
 KINDS = (*OPEN_LOOP, "worst")
 
 
-@dataclass(frozen=True)
-class WorstCase:
+@dataclass(frozen=True, eq=False)
+class WorstCase(ByValue):
     """Push along the gradient of e'Me, the direction in which the error energy grows fastest.
 
     Attributes:
@@ -207,8 +209,8 @@ class WorstCase:
         return np.where(np.any(error != 0.0, axis=-1, keepdims=True), gradient, situation.direction)
 
 
-@dataclass(frozen=True)
-class Disturbance:
+@dataclass(frozen=True, eq=False)
+class Disturbance(ByValue):
     """A disturbance of one kind and bound on chosen channels of the state.
 
     Attributes:
@@ -219,8 +221,8 @@ class Disturbance:
         metric: M for the kind `worst`: an array (n, n) or a function of the state.
 
     Raises:
-        ValueError: The kind is unknown, the bound is negative or not finite, the mask is empty, or
-            `worst` was asked for without a metric.
+        ValueError: The kind is unknown, the bound is negative or not finite, the mask is empty, the
+            metric is no metric of the state, or `worst` was asked for without one.
     """
 
     kind: str | Feedback
@@ -230,10 +232,10 @@ class Disturbance:
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        if isinstance(self.kind, str) and self.kind not in KINDS:
+        if not callable(self.kind) and self.kind not in KINDS:
             raise ValueError(
-                f"disturbance={self.kind!r} is not known; use one of {', '.join(KINDS)} "
-                "or a callable"
+                f"disturbance={shown(self.kind)} is not known; use one of {', '.join(KINDS)} or a "
+                f"callable{suggestion(self.kind, KINDS)}"
             )
         check_not_negative("disturbance_bound", self.bound)
         if not any(self.channels):
@@ -243,6 +245,10 @@ class Disturbance:
                 'disturbance="worst" needs a contraction metric: pass metric=M, an array (n, n) or '
                 "a function of the state"
             )
+        if self.metric is not None and not callable(self.metric):
+            metric = _checked_metric(self.metric, len(self.channels))
+            object.__setattr__(self, "metric", metric)
+            self._lock()
 
     @cached_property
     def feedback(self) -> Feedback | None:
@@ -346,10 +352,37 @@ def channel_mask(
             return (True,) * len(rates)
         if channels == "rates":
             return rates
-        raise ValueError(f'disturbance_channels={channels!r} must be "all", "rates" or a mask')
-    mask = tuple(bool(flag) for flag in channels)
+        raise ValueError(f'disturbance_channels={shown(channels)} must be "all", "rates" or a mask')
+    mask = np.asarray(channels)
+    if mask.dtype != np.bool_ or mask.ndim != 1:
+        raise ValueError(
+            f'disturbance_channels={shown(channels)} must be "all", "rates" or {len(rates)} '
+            "booleans, one per state"
+        )
     if len(mask) != len(rates):
         raise ValueError(
             f"disturbance_channels has {len(mask)} entries; the state has {len(rates)}"
         )
-    return mask
+    return tuple(mask.tolist())
+
+
+def _checked_metric(metric: Any, states: int) -> FloatArray:
+    """Return M (states, states) in double precision.
+
+    Raises:
+        ValueError: It has another shape, or is not symmetric and positive definite.
+    """
+    matrix = real_numbers(metric)
+    holds = (
+        matrix is not None
+        and matrix.shape == (states, states)
+        and bool(np.all(np.isfinite(matrix)))
+        and np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0)
+        and float(np.linalg.eigvalsh(matrix)[0]) > 0.0
+    )
+    if matrix is None or not holds:
+        raise ValueError(
+            f"metric={shown(metric)} must be a symmetric positive definite matrix of shape "
+            f"({states}, {states}), or a function of the state that gives one"
+        )
+    return matrix

@@ -24,6 +24,7 @@ from lagros_envs.conventions import built_like
 from lagros_envs.files import write_atomic
 from lagros_envs.reachable import way_exists
 from lagros_envs.reading import Record
+from lagros_envs.values import ByValue
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -38,7 +39,7 @@ GRID = 0.15  # cell of the grid on which a way is looked for [m]
 
 
 @dataclass(frozen=True, eq=False)
-class Scenario:
+class Scenario(ByValue):
     """One task: who starts where, wants to go where, and what stands in between.
 
     Attributes:
