@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import importlib.util
 import re
+import sys
 import tomllib
 from pathlib import Path
 
@@ -101,6 +104,32 @@ def test_the_commands_of_an_example_can_be_typed(example):
 @pytest.mark.parametrize("page", named(PAGES))
 def test_the_extras_that_a_page_names_exist(page):
     check_pip(page.read_text(encoding="utf-8").split())
+
+
+@pytest.mark.parametrize("page", named(PAGES))
+def test_what_the_python_of_a_page_imports_from_us_is_there(page):
+    for block in documents.python_blocks(page.read_text(encoding="utf-8")):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("lagros"):
+                for alias in node.names:
+                    if not hasattr(importlib.import_module(node.module), alias.name):
+                        importlib.import_module(f"{node.module}.{alias.name}")
+
+
+@pytest.mark.parametrize("example", named(EXAMPLES))
+def test_the_extra_that_an_example_names_brings_what_it_imports(example):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    text = example.read_text(encoding="utf-8")
+    (extra,) = EXTRAS.findall(text)
+    lines = [*project["dependencies"], *project["optional-dependencies"][extra]]
+    brought = {re.match(r"[A-Za-z0-9_-]+", line).group() for line in lines} | {"lagros_envs"}
+    imported = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            imported |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            imported.add(str(node.module).partition(".")[0])
+    assert imported - set(sys.stdlib_module_names) <= brought
 
 
 @pytest.mark.parametrize("page", named(PAGES))

@@ -71,9 +71,9 @@ def main(
 ) -> None:
     """Learning-based robust motion planning with guaranteed stability."""
     if version:
-        from importlib.metadata import version as installed
+        from lagros_benchmarks.surroundings import versions
 
-        typer.echo(f"lagros {installed('lagros')}")
+        typer.echo(f"lagros {versions().get('lagros', '(run from its folder, not installed)')}")
         raise typer.Exit
 
 
