@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lagros_envs import cartpole_task as task
 from lagros_envs.checks import check_positive, shown
 from lagros_policies.imitation.networks import Mlp, read_safetensors, write_safetensors
+from lagros_policies.observed import cartpole_rows
 from lagros_policies.trained_for import KEYS, cartpole_range, check_trained_for
 
 FloatArray = NDArray[np.float64]
@@ -211,8 +212,12 @@ class ActorPolicy:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, Any]:
-        """Return the mean action and the state as it came; see `Policy.predict`."""
-        features = np.asarray(observation, np.float32) @ self._features
+        """Return the mean action and the state as it came; see `Policy.predict`.
+
+        Raises:
+            ValueError: The observation is not one of the task, or not finite.
+        """
+        features = cartpole_rows(observation, np.float32) @ self._features
         features -= self._mean
         features /= self._std
         bound = self._feature_clip

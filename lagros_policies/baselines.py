@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lagros_envs import cartpole_task as task
 from lagros_envs.checks import check_positive
 from lagros_envs.dynamics import linearise_hold
+from lagros_policies.observed import cartpole_rows
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -94,9 +95,13 @@ class LqrPolicy:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, Any]:
-        """Return -K (x - x_f) as an action, and the state as it came; see the module."""
-        observation = np.asarray(observation, dtype=np.float64)
-        error = observation[..., task.GOAL] - observation[..., task.STATE]
+        """Return -K (x - x_f) as an action, and the state as it came; see the module.
+
+        Raises:
+            ValueError: The observation is not one of the task, or not finite.
+        """
+        rows = cartpole_rows(observation, np.float64)
+        error = rows[..., task.GOAL] - rows[..., task.STATE]
         return (error @ self._action_gain).astype(np.float32), state
 
 
@@ -125,6 +130,10 @@ class RandomPolicy:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, Any]:
-        """Draw one action per row of the observation, and return the state as it came."""
-        shape = (*np.shape(observation)[:-1], 1)
+        """Draw one action per row of the observation, and return the state as it came.
+
+        Raises:
+            ValueError: The observation is not one of the task, or not finite.
+        """
+        shape = (*cartpole_rows(observation, np.float64).shape[:-1], 1)
         return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32), state

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -180,7 +181,11 @@ class DistributedTubeMpcPolicy:
         memories: list[DistributedState | None] = row_memories(
             state, episode_start, count, "agents"
         )
-        following = [DistributedState() if memory is None else memory for memory in memories]
+        # Copies: what was returned before stays what it was.
+        following = [
+            DistributedState() if memory is None else replace(memory, map=copy(memory.map))
+            for memory in memories
+        ]
         nominal, accelerations = np.zeros((count, task.STATE_DIM)), np.zeros((count, 3))
         for row, memory in enumerate(following):
             nominal[row, PLANE], accelerations[row, :2] = self._follow(sensed, row, memory)

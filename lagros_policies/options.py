@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
+from lagros_envs.dynamics import System
 from lagros_envs.scenarios import Preset
 from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_policies.centralized import CentralizedPolicy
@@ -30,6 +32,7 @@ from lagros_policies.contraction.adaptive import (
 from lagros_policies.contraction.lagrangian import SlidingAxis, SlidingTracking
 from lagros_policies.contraction.metric import ContractionMetric
 from lagros_policies.contraction.neural.metric import load_neural_metric
+from lagros_policies.observed import cartpole_rows
 from lagros_policies.policy import PolicyState, row_memories
 from lagros_policies.tube_mpc import TubeMpcPolicy, TubeMpcState, check_shipped_metric
 
@@ -93,6 +96,12 @@ class AdaptiveState(TubeMpcState):
     wanted: FloatArray = field(default_factory=lambda: np.zeros(1))
 
 
+def _friction_and_mass(model: System, state: FloatArray, control: FloatArray) -> FloatArray:
+    """Return Y for both unknowns, shape (..., 1, 2)."""
+    parts = friction_regressor(state, control), cart_mass_regressor(model)(state, control)
+    return np.concatenate(parts, axis=-1)
+
+
 class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
     """Online tube MPC that finds a wrong friction or mass of the cart while it flies (aNCM).
 
@@ -125,12 +134,8 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
         """Build planner, law and adaptation."""
         super().__init__(settings, metric, replan_every, deadline, clock, allow_other_settings)
         law = self.expert.law
-        mass = cart_mass_regressor(law.system)
-
-        def regressor(state: FloatArray, control: FloatArray) -> FloatArray:
-            parts = friction_regressor(state, control), mass(state, control)
-            return np.concatenate(parts, axis=-1)
-
+        # A function of the module, so that the policy can be pickled.
+        regressor = partial(_friction_and_mass, law.system)
         gain = largest_gain(law, _REACH)
         self.adaptive = AdaptiveControl(law, regressor, gain, _LEAKAGE, _LIMITS)
 
@@ -142,7 +147,7 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Plan, learn and track; see `Policy.predict`. The state is one per row."""
-        count = len(np.atleast_2d(observation))
+        count = len(np.atleast_2d(cartpole_rows(observation, np.float64)))
         memories = row_memories(state, episode_start, count, "episodes")
         fresh = [AdaptiveState() if memory is None else memory for memory in memories]
         return super().predict(observation, fresh, None, deterministic)

@@ -22,6 +22,7 @@ from lagros_envs.scenarios import Preset
 from lagros_policies.barrier import BarrierSettings, BrakingBarrier, HalfPlanes
 from lagros_policies.contraction.thrusters import allocate, to_body
 from lagros_policies.half_planes import nearest
+from lagros_policies.observed import as_numbers
 from lagros_policies.policy import Policy, PolicyState
 from lagros_policies.sensed import Sensed, WorldState
 from lagros_policies.spacecraft_setup import PLANE, task_and_preset
@@ -140,7 +141,7 @@ class SafetyFilter:
             ValueError: The observation, the state or the inner action has a wrong shape, or is not
                 finite.
         """
-        rows = np.atleast_2d(observation)
+        rows = np.atleast_2d(as_numbers(observation, np.float64))
         sensed = Sensed.of(self.layout, rows) if self.observes == "local" else self._sensed(rows)
         inner, counts = self._remembered(state, len(rows), episode_start)
         wanted, inner = self.policy.predict(observation, inner, episode_start, deterministic)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lagros_envs.observation import NEIGHBOUR_DIM, OBSTACLE_DIM, Layout
 from lagros_envs.spacecraft_task import STATE_DIM
+from lagros_policies.observed import as_numbers
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -84,7 +85,7 @@ class Sensed(NamedTuple):
         Raises:
             ValueError: The observation has another shape or is not finite.
         """
-        rows = np.asarray(observation, np.float64)
+        rows = as_numbers(observation, np.float64)
         if rows.ndim == 1:
             rows = rows[None]
         if rows.ndim != 2 or rows.shape[1] != layout.size:
@@ -140,7 +141,7 @@ class WorldState(NamedTuple):
         ends = np.cumsum(
             [1, STATE_DIM * agents, 2 * agents, OBSTACLE_DIM * obstacles, obstacles]
         ).tolist()
-        rows = np.asarray(observation, np.float64)
+        rows = as_numbers(observation, np.float64)
         if rows.ndim == 1:
             rows = rows[None]
         if rows.ndim != 2 or rows.shape[1] != ends[-1]:

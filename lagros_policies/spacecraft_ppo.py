@@ -62,7 +62,7 @@ def look(layout: Layout, observation: NDArray[np.floating]) -> Seen:
 
     Args:
         layout: Of the environment.
-        observation: Shape (B, layout.size).
+        observation: Shape (B, layout.size), or (layout.size,) for one.
 
     Returns:
         Features, float32: the goal's distance, twice, the velocity (2), the spin; then for each of
@@ -227,6 +227,6 @@ class SpacecraftPpoPolicy:
         Raises:
             ValueError: The observation is not of this task.
         """
-        seen = look(self.layout, np.atleast_2d(observation))
+        seen = look(self.layout, observation)
         thrust = thrust_of(self.settings, seen.axes, self.network(seen.features))
         return (thrust if np.ndim(observation) == 2 else thrust[0]), state

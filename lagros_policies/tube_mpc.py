@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -16,6 +17,7 @@ from lagros_envs.checks import check_above, check_whole
 from lagros_envs.dynamics import CartPole
 from lagros_policies.contraction import ContractionMetric, load_metric
 from lagros_policies.expert import CartPoleExpert, TrackedPlans
+from lagros_policies.observed import cartpole_rows
 from lagros_policies.planning import Trajectory
 from lagros_policies.policy import PolicyState, row_memories
 from lagros_policies.trained_for import cartpole_design, check_trained_for
@@ -105,12 +107,18 @@ class TubeMpcPolicy:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
-        """Plan if it is time, and track; see `Policy.predict`. The state is one per row."""
-        rows = np.atleast_2d(np.asarray(observation, np.float64))
+        """Plan if it is time, and track; see `Policy.predict`. The state is one per row.
+
+        Raises:
+            ValueError: The observation is not one of the task, or not finite, or the state is not
+                of these rows.
+        """
+        rows = np.atleast_2d(cartpole_rows(observation, np.float64))
         memories: list[TubeMpcState | None] = row_memories(
             state, episode_start, len(rows), "episodes"
         )
-        fresh = [TubeMpcState() if memory is None else memory for memory in memories]
+        # Copies: what was returned before stays what it was.
+        fresh = [TubeMpcState() if memory is None else copy(memory) for memory in memories]
         force = np.array(
             [self._force(row, memory) for row, memory in zip(rows, fresh, strict=True)]
         )

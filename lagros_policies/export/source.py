@@ -14,6 +14,7 @@ from lagros_envs.observation import Layout
 from lagros_envs.scenarios import Preset
 from lagros_envs.spacecraft_task import THRUSTERS, SpacecraftSettings
 from lagros_policies.imitation.deep_set import DeepSet
+from lagros_policies.imitation.features import cartpole_features
 from lagros_policies.imitation.network_policy import PRETRAINED, NetworkPolicy
 from lagros_policies.imitation.networks import Mlp
 from lagros_policies.imitation.spacecraft_policy import SpacecraftNetworkPolicy
@@ -73,8 +74,12 @@ class NetworkSource:
         return self.answer(observation)[:, 0]
 
     def answer(self, observation: Float32Array) -> Float32Array:
-        """Return the same as `force`, shape (B, 1) [N]."""
-        return self.policy.predict(observation)[0]
+        """Return the same as `force`, shape (B, 1) [N].
+
+        It is `predict` without the check that the observation is finite, which an export lacks.
+        """
+        features, side = cartpole_features(observation)
+        return self.network(features) * side[..., None]
 
     def examples(self, count: int, seed: int = 0) -> Float32Array:
         """Return random observations, shape (count, 13); see `example_observations`."""

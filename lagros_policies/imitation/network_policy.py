@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lagros_envs import cartpole_task as task
 from lagros_policies.imitation.features import FEATURES, cartpole_features
 from lagros_policies.imitation.networks import Mlp
+from lagros_policies.observed import cartpole_rows
 from lagros_policies.policy import PolicyState
 from lagros_policies.trained_for import cartpole_range, check_trained_for
 
@@ -73,8 +74,12 @@ class NetworkPolicy:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
-        """Evaluate the network; see `Policy.predict`."""
-        features, side = cartpole_features(np.asarray(observation, np.float32))
+        """Evaluate the network; see `Policy.predict`.
+
+        Raises:
+            ValueError: The observation is not one of the task, or not finite.
+        """
+        features, side = cartpole_features(cartpole_rows(observation, np.float32))
         force = self.network(features)
         return force * (side[..., None] * self._unit), state
 

@@ -41,7 +41,7 @@ class Mlp:
         biases: Sequence[NDArray[np.floating]],
         metadata: dict[str, str] | None = None,
     ) -> None:
-        """Copy the layers to float32 and allocate the buffers of a single evaluation."""
+        """Copy the layers to float32."""
         if not weights or len(weights) != len(biases):
             raise ValueError(f"{len(weights)} weight matrices need as many biases")
         self.weights = [np.array(weight, np.float32, order="C") for weight in weights]
@@ -57,8 +57,9 @@ class Mlp:
             if not (np.all(np.isfinite(weight)) and np.all(np.isfinite(bias))):
                 raise ValueError(f"layer {index} holds numbers that are not finite")
             width = weight.shape[1]
-        self._buffers = [np.empty(bias.shape, np.float32) for bias in self.biases]
-        self._hidden = list(zip(self.weights, self.biases, self._buffers, strict=True))[:-1]
+        self._hidden = list(zip(self.weights, self.biases, strict=True))[:-1]
+        # Buffers of the hidden layers that no evaluation is using: several threads may evaluate.
+        self._free = [self._new_buffers()]
 
     @property
     def inputs(self) -> int:
@@ -77,8 +78,7 @@ class Mlp:
             features: Shape (inputs,) or (batch, inputs), float32.
 
         Returns:
-            Shape (outputs,) or (batch, outputs). For a single evaluation it is a buffer that the
-            next one overwrites.
+            Shape (outputs,) or (batch, outputs).
         """
         if features.ndim == 1:
             return self._single(features)
@@ -88,16 +88,23 @@ class Mlp:
         return layer @ self.weights[-1] + self.biases[-1]
 
     def _single(self, features: Float32Array) -> Float32Array:
+        try:
+            buffers = self._free.pop()
+        except IndexError:
+            buffers = self._new_buffers()
         layer = features
-        for weight, bias, buffer in self._hidden:
+        for (weight, bias), buffer in zip(self._hidden, buffers, strict=True):
             np.dot(layer, weight, out=buffer)
             np.add(buffer, bias, out=buffer)
             np.tanh(buffer, out=buffer)
             layer = buffer
-        last = self._buffers[-1]
-        np.dot(layer, self.weights[-1], out=last)
-        np.add(last, self.biases[-1], out=last)
+        last: Float32Array = np.dot(layer, self.weights[-1])
+        last += self.biases[-1]
+        self._free.append(buffers)
         return last
+
+    def _new_buffers(self) -> list[Float32Array]:
+        return [np.empty(bias.shape, np.float32) for _, bias in self._hidden]
 
     def save(self, path: Path | str) -> None:
         """Write weights and metadata as safetensors, atomically."""

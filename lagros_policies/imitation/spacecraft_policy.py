@@ -15,6 +15,7 @@ from lagros_policies.contraction.thrusters import allocate
 from lagros_policies.imitation.deep_set import DeepSet
 from lagros_policies.imitation.network_policy import PRETRAINED
 from lagros_policies.imitation.spacecraft_features import SpacecraftFeatures, spacecraft_features
+from lagros_policies.observed import as_numbers
 from lagros_policies.policy import PolicyState
 from lagros_policies.sensed import Sensed
 from lagros_policies.spacecraft_setup import task_and_preset
@@ -84,7 +85,7 @@ class SpacecraftNetworkPolicy:
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Evaluate the network for one agent (o,) or many (B, o); see `Policy.predict`."""
-        rows = np.asarray(observation, np.float32)
+        rows = as_numbers(observation, np.float32)
         action = self.thrust(rows) * (1.0 / self.settings.thrust_scale)
         return (action if rows.ndim == 2 else action[0]).astype(np.float32), state
 

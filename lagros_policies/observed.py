@@ -1,0 +1,55 @@
+"""What a policy accepts as an observation: finite numbers in the shape of the task."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.cartpole_task import OBSERVATION_DIM
+
+Number = TypeVar("Number", np.float32, np.float64)
+
+_ONE = (OBSERVATION_DIM,)
+
+
+def as_numbers(observation: Any, dtype: type[Number]) -> NDArray[Number]:
+    """Return an observation as an array; it is not copied where it is one already.
+
+    Raises:
+        ValueError: It is not made of numbers.
+    """
+    try:
+        return np.asarray(observation, dtype)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"the observation is a {type(observation).__name__}, not an array of numbers ({error})"
+        ) from error
+
+
+def cartpole_rows(observation: Any, dtype: type[Number]) -> NDArray[Number]:
+    """Return observations of the cart-pole, (13,) or (B, 13), as an array.
+
+    Args:
+        observation: As the environment returns it, one or a batch.
+        dtype: Single or double precision.
+
+    Raises:
+        ValueError: It has another shape, or is not made of finite numbers.
+    """
+    rows = as_numbers(observation, dtype)
+    # The square is the quickest look at one row: beyond 1e19 it is none of the task, and looked at
+    # again.
+    if rows.shape == _ONE and rows.dot(rows) < math.inf:
+        return rows
+    if rows.ndim not in (1, 2) or rows.shape[-1] != OBSERVATION_DIM:
+        raise ValueError(
+            f"the observation has shape {rows.shape}; it must be ({OBSERVATION_DIM},), or "
+            f"(B, {OBSERVATION_DIM}) for a batch: build the policy from the environment that it "
+            "flies, without wrappers"
+        )
+    if not np.isfinite(rows).all():
+        raise ValueError("the observation is not finite")
+    return rows
