@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import importlib
-import json
+import io
 import zipfile
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
@@ -13,10 +13,16 @@ from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task, spacecraft_task
 from lagros_envs.observation import Layout
+from lagros_envs.reading import check_file, parse_json
 from lagros_envs.scenarios import Preset, preset_named
 from lagros_policies.naming import ALGORITHMS
 
 Float32Array = NDArray[np.float32]
+
+# What a file may expand to [bytes] and how many entries it may have: a policy of a hundred layers
+# has less.
+MOST_EXPANDED = 1 << 28
+MOST_ENTRIES = 100
 
 
 class StableBaselines3Policy:
@@ -30,7 +36,8 @@ class StableBaselines3Policy:
             None for the cart-pole.
 
     Raises:
-        ValueError: The model was trained on other spaces, or there is no such preset.
+        ValueError: The model was trained on other spaces or within other bounds of the action, or
+            there is no such preset.
     """
 
     observes: Literal["local", "global"] = "local"
@@ -44,6 +51,13 @@ class StableBaselines3Policy:
                 f"{name} was trained on observations of shape {spaces[0]} and actions of shape "
                 f"{spaces[1]}; {where} {expected[0]} and {expected[1]}. A model that was trained "
                 "behind wrappers cannot be used without them"
+            )
+        low = -1.0 if preset is None else 0.0
+        if not (np.all(model.action_space.low == low) and np.all(model.action_space.high == 1.0)):
+            raise ValueError(
+                f"{name} was trained on actions from {np.min(model.action_space.low):g} to "
+                f"{np.max(model.action_space.high):g}; those of the task are from {low:g} to 1. A "
+                "model that was trained behind wrappers cannot be used without them"
             )
         self.name = name
         self.model = model
@@ -94,12 +108,11 @@ def load_stable_baselines3(
     Raises:
         FileNotFoundError: There is no such file.
         ImportError: The extra `rl` is not installed.
-        ValueError: The file is no such model, its algorithm is unknown or cannot be detected, or
-            its spaces are not those of the task.
+        ValueError: The file is no such model, would expand to more than `MOST_EXPANDED`, its
+            algorithm is unknown or cannot be detected, or its spaces are not those of the task.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no stable-baselines3 model {path}")
+    check_archive(path)
     chosen = detect_algorithm(path) if algorithm is None else algorithm.upper()
     if chosen not in ALGORITHMS:
         raise ValueError(f"algorithm {algorithm!r} is not known; use one of {_known()}")
@@ -114,7 +127,7 @@ def load_stable_baselines3(
     except Exception as error:  # a pickle can raise anything
         raise ValueError(
             f"{path} could not be loaded as a {chosen} model of stable-baselines3 "
-            f"{library.__version__} ({type(error).__name__}: {error})"
+            f"{library.__version__} ({_line(error)})"
         ) from error
     return StableBaselines3Policy(model, path.stem, preset)
 
@@ -138,12 +151,13 @@ def detect_algorithm(path: Path | str) -> str:
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            data = json.loads(archive.read("data"))
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
+            text = archive.read("data")
+    except Exception as error:  # zipfile, zlib and the system each raise their own
         raise ValueError(
             f"{path} is not a model saved by stable-baselines3: it has no readable entry 'data' "
-            f"({error})"
+            f"({_line(error)})"
         ) from error
+    data = parse_json(text, f"{path}: its entry 'data'", all_finite=False)
     if not isinstance(data, dict):
         raise _unclear(path)
     kind = data.get("policy_class")
@@ -160,6 +174,60 @@ def detect_algorithm(path: Path | str) -> str:
     if "gae_lambda" in data and "normalize_advantage" in data:
         return "A2C"
     raise _unclear(path)
+
+
+def check_archive(path: Path) -> None:
+    """Check, before anything in it is expanded, that a zip is no larger than a model.
+
+    Args:
+        path: The zip file; the weights in it are zips of their own.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no zip, has entries that no model has, or would expand to too much.
+    """
+    name = check_file(path, MOST_EXPANDED)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            expanded = _expanded(archive)
+            for entry in archive.namelist():
+                if entry.endswith(".pth") and expanded <= MOST_EXPANDED:
+                    weights = io.BytesIO(archive.read(entry))
+                    if zipfile.is_zipfile(weights):
+                        with zipfile.ZipFile(weights) as inner:
+                            expanded += _expanded(inner)
+    except Exception as error:  # zipfile, zlib and the system each raise their own
+        raise ValueError(
+            f"{name} is not a model saved by stable-baselines3 ({_line(error)})"
+        ) from error
+    if expanded > MOST_EXPANDED:
+        raise ValueError(
+            f"{name} would expand to {expanded / 1e6:.0f} MB, more than the "
+            f"{MOST_EXPANDED / 1e6:.0f} MB that a model may have; if you trust it, load it with "
+            "stable-baselines3 and pass it to StableBaselines3Policy"
+        )
+
+
+def _expanded(archive: zipfile.ZipFile) -> int:
+    """Return what the entries say they expand to; zipfile reads no more of them.
+
+    Raises:
+        ValueError: There are too many, or one has no name of a plain file.
+    """
+    entries = archive.infolist()
+    if len(entries) > MOST_ENTRIES:
+        raise ValueError(f"it has {len(entries)} entries; a model has at most {MOST_ENTRIES}")
+    if len({entry.filename for entry in entries}) < len(entries):
+        raise ValueError("it names an entry twice")
+    for entry in entries:
+        place = PurePosixPath(entry.filename.replace("\\", "/"))
+        if place.is_absolute() or ".." in place.parts:
+            raise ValueError(f"its entry {entry.filename!r} lies outside of it")
+    return sum(entry.file_size for entry in entries)
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def _unclear(path: Path | str) -> ValueError:

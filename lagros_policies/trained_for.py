@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.dynamics import CartPole
+from lagros_envs.reading import parse_json
 from lagros_envs.scenarios import Preset, preset_named
 from lagros_envs.spacecraft_task import SpacecraftSettings
 
@@ -116,10 +117,7 @@ def _range_of(metadata: Mapping[str, str], what: str, assumed: Range) -> Range:
     text = metadata.get(SETTINGS)
     if text is None:
         return assumed
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{what}: its {SETTINGS!r} is not JSON ({error})") from error
+    value = parse_json(text, f"{what}: its {SETTINGS!r}")
     if not isinstance(value, dict) or not all(isinstance(part, dict) for part in value.values()):
         raise ValueError(f"{what}: its {SETTINGS!r} must be rules, names and values")
     return value

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import clarabel  # at once: a fallback that is missing must not show in the middle of an episode
 import numpy as np
 import piqp
 from numpy.typing import NDArray
@@ -91,8 +92,6 @@ def solve_with_piqp(program: QuadraticProgram, tolerance: float) -> QpSolution:
 
 def solve_with_clarabel(program: QuadraticProgram, tolerance: float) -> QpSolution:
     """Solve with Clarabel (interior point, homogeneous embedding): slower, hard to upset."""
-    import clarabel
-
     size = program.cost_diagonal.size
     above = np.flatnonzero(program.high < UNBOUNDED)
     below = np.flatnonzero(program.low > -UNBOUNDED)

@@ -102,6 +102,52 @@ def test_a_package_that_is_missing_is_named(env, monkeypatch):
         make("lagros", env)
 
 
+MISSING = """
+import sys
+missing = sys.argv[1]
+sys.modules[missing] = None
+import numpy as np
+import lagros_policies
+from lagros_envs import spacecraft_v0
+from lagros_envs.cartpole import CartPoleEnv
+from lagros_policies.policy import SPACECRAFT_NAMES
+failed = []
+for names, env in (
+    (lagros_policies.NAMES, CartPoleEnv()),
+    (SPACECRAFT_NAMES, spacecraft_v0.parallel_env(1, "open")),
+):
+    for name in names:
+        try:
+            policy = lagros_policies.make(name, env)
+        except ImportError as error:
+            assert missing in str(error).lower() and "pip install 'lagros[" in str(error), error
+            failed.append(name)
+            continue
+        # Who was built flies.
+        seen, _ = env.reset(seed=0)
+        if isinstance(seen, dict):
+            seen = env.state() if policy.observes == "global" else seen["agent_0"]
+        policy.predict(seen)
+print(*failed)
+"""
+
+
+@pytest.mark.parametrize(
+    ("package", "names"),
+    [
+        ("clarabel", {"tube-mpc", "centralized"}),
+        ("piqp", {"tube-mpc", "centralized"}),
+        ("scipy", {"lqr", "tube-mpc", "centralized"}),
+        ("safetensors", {"learned", "lagros", "ppo", "sac", "td3", "residual"}),
+        ("torch", set()),
+        ("cvxpy", set()),
+        ("joblib", set()),
+    ],
+)
+def test_a_missing_package_stops_who_needs_it_before_the_first_episode(run_python, package, names):
+    assert set(run_python(MISSING, package).split()) == names
+
+
 def test_environment_of_another_package_is_refused():
     other = gym.make("CartPole-v1")
     with pytest.raises(TypeError, match="CartPole"):

@@ -2,9 +2,12 @@
 
 import base64
 import json
+import os
 import pickle
 import sys
+import tracemalloc
 import zipfile
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import gymnasium as gym
@@ -199,3 +202,114 @@ def test_the_missing_extra_is_named(zips, monkeypatch):
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     with pytest.raises(ImportError, match=r"lagros\[rl\]"):
         load_stable_baselines3(zips["PPO"])
+
+
+def zipped(path, entries, kind=zipfile.ZIP_DEFLATED):
+    with zipfile.ZipFile(path, "w", kind) as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+    return path
+
+
+def entries_of(path):
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+@pytest.fixture(scope="module")
+def bomb(tmp_path_factory):
+    """Return a zip that expands to 315 MB from a two-hundredth of it, or less."""
+    path = tmp_path_factory.mktemp("bomb") / "bomb.zip"
+    block = bytes(1 << 20)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        archive.writestr("data", "{}")
+        with archive.open("policy.pth", "w") as stream:
+            for _ in range(300):
+                stream.write(block)
+    return path
+
+
+def test_a_zip_that_expands_to_too_much_is_refused_before_it_does(bomb):
+    assert bomb.stat().st_size < 2e6
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=r"bomb\.zip would expand to 315 MB"):
+            lagros_policies.make(str(bomb), CartPoleEnv())
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_weights_that_expand_to_too_much_are_refused(bomb, zips, tmp_path):
+    entries = entries_of(zips["PPO"]) | {"policy.pth": bomb.read_bytes()}
+    path = zipped(tmp_path / "outer.zip", entries)
+    with pytest.raises(ValueError, match=r"outer\.zip would expand to 3\d\d MB"):
+        lagros_policies.make(f"ppo:{path}", CartPoleEnv())
+
+
+@pytest.mark.parametrize(
+    ("entries", "reason"),
+    [
+        ({"../../data": "x"}, "outside"),
+        ({"/data": "x"}, "outside"),
+        ({"..\\data": "x"}, "outside"),
+        ({f"data{index}": "x" for index in range(200)}, "200 entries"),
+        ({"data": "[" * 200_000}, "nested"),
+        ({"data": "1"}, "algorithm"),
+        ({"data": b"\xff\xfe"}, "UTF-8"),
+        ({"data": ""}, "empty"),
+        ({"else": "x"}, "no readable entry"),
+        ({}, "no readable entry"),
+    ],
+)
+def test_a_zip_that_is_no_model_is_refused_in_one_line(tmp_path, entries, reason):
+    path = zipped(tmp_path / "odd.zip", entries)
+    with pytest.raises(ValueError, match=reason) as caught:
+        lagros_policies.make(str(path), CartPoleEnv())
+    assert "odd.zip" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_zips_are_refused_in_one_line(zips, tmp_path):
+    whole = zips["PPO"].read_bytes()
+    rng = np.random.default_rng(0)
+    damaged = [whole[:count] for count in (0, 1, 100, len(whole) // 2, len(whole) - 1)]
+    for _ in range(40):
+        bytes_ = bytearray(whole)
+        for place in rng.integers(0, len(whole), 20):
+            bytes_[place] = rng.integers(256)
+        damaged.append(bytes(bytes_))
+    for data in damaged:
+        path = tmp_path / "damaged.zip"
+        path.write_bytes(data)
+        # What stays loadable may load.
+        with suppress(ValueError), refused_in_one_line("damaged.zip"):
+            lagros_policies.make(str(path), CartPoleEnv())
+
+
+@contextmanager
+def refused_in_one_line(name):
+    try:
+        yield
+    except ValueError as error:
+        if name not in str(error) or "\n" in str(error):
+            raise AssertionError(f"not one line that names the file: {error}") from error
+        raise
+
+
+def test_no_file_of_the_kind(tmp_path):
+    folder = tmp_path / "folder.zip"
+    folder.mkdir()
+    with pytest.raises(ValueError, match=r"folder\.zip"):
+        lagros_policies.make(str(folder), CartPoleEnv())
+    pipe = tmp_path / "pipe.zip"
+    os.mkfifo(pipe)
+    with pytest.raises(ValueError, match=r"pipe\.zip"):
+        lagros_policies.make(str(pipe), CartPoleEnv())
+
+
+def test_a_model_of_rescaled_actions_is_refused(tmp_path):
+    wide = gym.wrappers.RescaleAction(CartPoleEnv(), np.float32(-3.0), np.float32(3.0))
+    PPO("MlpPolicy", wide, policy_kwargs={"net_arch": [4]}, device="cpu").save(tmp_path / "wide")
+    with pytest.raises(ValueError, match="wide was trained on actions from -3 to 3"):
+        lagros_policies.make(str(tmp_path / "wide.zip"), CartPoleEnv())
