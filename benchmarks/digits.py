@@ -5,7 +5,8 @@
 
 Both sides run here, one after the other, on the same processor and libraries: figures that are
 compared across machines differ in their last digits. Everything is compared but times and the
-names of the machine and its libraries. The exit status is 1 where something differs.
+names of the machine and its libraries; what only the working tree has is counted and is no
+difference. The exit status is 1 where something differs.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -112,15 +112,17 @@ def _probed(tree: Path, rows: str) -> dict[str, Any]:
 
 
 def _report(before: dict[str, Any], after: dict[str, Any]) -> int:
-    """Print the rows and where they differ first; return the exit status."""
+    """Print every row and where it differs; return the exit status."""
     different = 0
     for name in before | after:
-        pairs = zip_longest(_leaves(before.get(name)), _leaves(after.get(name)))
-        changed = [(old, new) for old, new in pairs if repr(old) != repr(new)]
+        old, new = dict(_leaves(before.get(name))), dict(_leaves(after.get(name)))
+        changed = [place for place in old if repr(old[place]) != repr(new.get(place, "(gone)"))]
+        added = sorted(new.keys() - old.keys())
         different += bool(changed)
-        print(f"{'DIFFERS' if changed else 'same':8} {name}")
-        for old, new in changed[:5]:
-            print(f"           {old} -> {new}")
+        note = f", with {len(added)} more entries such as {added[0]}" if added else ""
+        print(f"{'DIFFERS' if changed else 'same':8} {name}{note}")
+        for place in changed[:5]:
+            print(f"           {place}: {old[place]!r} -> {new.get(place, '(gone)')!r}")
         if len(changed) > 5:
             print(f"           and {len(changed) - 5} more")
     print(f"{different} of {len(before | after)} rows differ")
