@@ -1,11 +1,13 @@
 """Equations of motion, written once, and what is derived from them.
 
-`cartpole` and `spacecraft` hold the physics; `dual` differentiates it; `integrate` holds a control
-over one step; `system` derives drift, control matrix, Jacobians and the SDC matrix for any system.
+`cartpole` and `spacecraft` hold the physics; `integrate` holds a control over one step; `system`
+derives drift, control matrix, Jacobians and the SDC matrix for any system; `check` tries a system
+of your own on every kind of number.
 `straight_line`, `held` and `compiled` run a held step without the overhead of calling the two.
 """
 
 from lagros_envs.dynamics.cartpole import CartPole
+from lagros_envs.dynamics.check import check_system
 from lagros_envs.dynamics.integrate import hold_control_slope, hold_step, linearise_hold
 from lagros_envs.dynamics.spacecraft import Spacecraft
 from lagros_envs.dynamics.system import (
@@ -24,6 +26,7 @@ __all__ = [
     "Functions",
     "Spacecraft",
     "System",
+    "check_system",
     "control_matrix",
     "hold_control_slope",
     "hold_step",

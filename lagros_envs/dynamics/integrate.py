@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import dual
 from lagros_envs.dynamics.system import Components, System, components
+from lagros_envs.numbers import dual, functions
 
 FloatArray = NDArray[np.float64]
 
@@ -108,7 +108,7 @@ def hold_control_slope(
     force = float(control[0]) if state.ndim == 1 else control[..., 0]
     one = 1.0 if state.ndim == 1 else np.ones_like(force)
     push = [dual.Dual(force, one)]
-    parts = rk4_hold(system, start, push, [0.0] * system.state_dim, duration, dual)
+    parts = rk4_hold(system, start, push, [0.0] * system.state_dim, duration, functions)
     # The held force reaches every rate in the first substep, so that all parts are duals.
     following = np.stack([part.value for part in parts], axis=-1)
     return following, np.stack([part.gradient for part in parts], axis=-1)

@@ -8,7 +8,6 @@ is reordered, so that every result has the bits that calling the function would 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -17,6 +16,8 @@ from numpy.typing import NDArray
 
 from lagros_envs.dynamics.integrate import SUBSTEPS, rk4_hold
 from lagros_envs.dynamics.system import System
+from lagros_envs.numbers import functions as elementary
+from lagros_envs.numbers.recorded import Operation, Recorded, Tape, operand_text
 
 FloatArray = NDArray[np.float64]
 
@@ -27,125 +28,15 @@ _UFUNCS: dict[str, Any] = {
     "/": np.divide,
     "sin": np.sin,
     "cos": np.cos,
+    "tan": np.tan,
+    "exp": np.exp,
     "sqrt": np.sqrt,
     "abs": np.absolute,
 }
 # What the sources that are written here begin with.
-IMPORTS = "from math import cos, sin, sqrt"
+IMPORTS = "from math import cos, exp, sin, sqrt, tan"
 # (x, u, given, functions) -> what else to compute from the state at the end of a step.
 Measure = Callable[[Sequence[Any], Sequence[Any], Sequence[Any], Any], Sequence[Any]]
-
-
-class Operation(NamedTuple):
-    """One operation; its result is called `%i` for its place i on the tape.
-
-    Attributes:
-        symbol: `+`, `-`, `*`, `/`, `sin`, `cos`, `sqrt` or `abs`.
-        operands: Names of inputs, results, or the text of a constant.
-    """
-
-    symbol: str
-    operands: tuple[str, ...]
-
-
-class Tape:
-    """Operations in the order in which they were recorded, equal ones only once."""
-
-    def __init__(self) -> None:
-        """Begin with nothing."""
-        self.operations: list[Operation] = []
-        self._known: dict[Operation, Recorded] = {}
-
-    def record(self, symbol: str, *operands: Any) -> Recorded:
-        """Note an operation and return its result; a product with one is the other factor.
-
-        Raises:
-            TypeError: An operand is neither a `Recorded` nor a finite number.
-        """
-        if symbol == "*" and "1.0" in map(_text, operands):
-            first, second = operands
-            factor = second if _text(first) == "1.0" else first
-            if isinstance(factor, Recorded):
-                return factor
-        operation = Operation(symbol, tuple(map(_text, operands)))
-        if operation not in self._known:
-            self._known[operation] = Recorded(self, f"%{len(self.operations)}")
-            self.operations.append(operation)
-        return self._known[operation]
-
-
-class Recorded:
-    """A number whose operations go onto a tape; it has no value to branch on.
-
-    Attributes:
-        tape: Where they go.
-        name: Name of the number on the tape.
-    """
-
-    __slots__ = ("name", "tape")
-
-    def __init__(self, tape: Tape, name: str) -> None:
-        """Name a number."""
-        self.tape, self.name = tape, name
-
-    def __add__(self, other: Any) -> Recorded:
-        """Record a sum."""
-        return self.tape.record("+", self, other)
-
-    def __radd__(self, other: Any) -> Recorded:
-        """Record a sum with a constant on the left."""
-        return self.tape.record("+", other, self)
-
-    def __sub__(self, other: Any) -> Recorded:
-        """Record a difference."""
-        return self.tape.record("-", self, other)
-
-    def __rsub__(self, other: Any) -> Recorded:
-        """Record a difference with a constant on the left."""
-        return self.tape.record("-", other, self)
-
-    def __mul__(self, other: Any) -> Recorded:
-        """Record a product."""
-        return self.tape.record("*", self, other)
-
-    def __rmul__(self, other: Any) -> Recorded:
-        """Record a product with a constant on the left."""
-        return self.tape.record("*", other, self)
-
-    def __truediv__(self, other: Any) -> Recorded:
-        """Record a quotient."""
-        return self.tape.record("/", self, other)
-
-    def __rtruediv__(self, other: Any) -> Recorded:
-        """Record a quotient with a constant on the left."""
-        return self.tape.record("/", other, self)
-
-    def __abs__(self) -> Recorded:
-        """Record an absolute value."""
-        return self.tape.record("abs", self)
-
-    def __bool__(self) -> bool:
-        """Refuse: what is recorded may not branch."""
-        raise TypeError("an equation of motion must not branch on its state: it is recorded once")
-
-
-class Recording:
-    """The elementary functions of `Recorded` numbers, as a namespace for `System.derivative`."""
-
-    @staticmethod
-    def sin(x: Recorded) -> Recorded:
-        """Record a sine."""
-        return x.tape.record("sin", x)
-
-    @staticmethod
-    def cos(x: Recorded) -> Recorded:
-        """Record a cosine."""
-        return x.tape.record("cos", x)
-
-    @staticmethod
-    def sqrt(x: Recorded) -> Recorded:
-        """Record a square root."""
-        return x.tape.record("sqrt", x)
 
 
 class StraightLine(NamedTuple):
@@ -188,7 +79,9 @@ def straight_line(
             numbers.
     """
     tape = Tape()
-    results = [_text(result) for result in function([Recorded(tape, name) for name in inputs])]
+    results = [
+        operand_text(result) for result in function([Recorded(tape, name) for name in inputs])
+    ]
     needed = set(results)
     kept: dict[str, Operation] = {}
     for place in range(len(tape.operations) - 1, -1, -1):
@@ -202,7 +95,7 @@ def recorded_hold(
     system: System,
     duration: float,
     substeps: int = SUBSTEPS,
-    functions: Any = Recording,
+    functions: Any = elementary,
     measure: Measure | None = None,
     given: int = 0,
 ) -> StraightLine:
@@ -234,7 +127,7 @@ def recorded_hold(
 
 
 def recorded_measure(
-    system: System, measure: Measure, given: int = 0, functions: Any = Recording
+    system: System, measure: Measure, given: int = 0, functions: Any = elementary
 ) -> StraightLine:
     """Record a measure alone: inputs x0... at the end of a step, u0..., g0....
 
@@ -345,14 +238,6 @@ class ArrayFunction:
         for function, arguments in self._calls:
             function(*arguments)
         return self.outputs
-
-
-def _text(operand: Any) -> str:
-    if isinstance(operand, Recorded):
-        return operand.name
-    if isinstance(operand, float | int) and math.isfinite(operand):
-        return repr(float(operand))
-    raise TypeError(f"{operand!r} is no finite number; an equation of motion works on numbers")
 
 
 def _array(name: str, arrays: dict[str, FloatArray]) -> FloatArray:

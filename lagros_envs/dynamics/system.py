@@ -12,7 +12,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import dual
+from lagros_envs.numbers import dual, functions
 
 FloatArray = NDArray[np.float64]
 # One entry per coordinate: floats, arrays of a batch, or duals. The physics does not mind which.
@@ -26,13 +26,25 @@ _SDC_WEIGHTS = 0.5 * _WEIGHTS
 
 
 class Functions(Protocol):
-    """Elementary functions that an equation of motion may call (`math`, `numpy` or `dual`)."""
+    """Elementary functions that an equation of motion may call.
+
+    `lagros_envs.numbers.functions`, which every kind of number knows, or `math` or `numpy`.
+    """
 
     def sin(self, x: Any, /) -> Any:
         """Return the sine."""
 
     def cos(self, x: Any, /) -> Any:
         """Return the cosine."""
+
+    def tan(self, x: Any, /) -> Any:
+        """Return the tangent."""
+
+    def exp(self, x: Any, /) -> Any:
+        """Return the exponential."""
+
+    def sqrt(self, x: Any, /) -> Any:
+        """Return the square root."""
 
 
 class System(Protocol):
@@ -88,7 +100,7 @@ def jacobian(
     n, m = system.state_dim, system.control_dim
     arrays = [np.broadcast_to(part, shape) for part in components(state) + components(control)]
     seeds = dual.seed(arrays)
-    rates = list(system.derivative(seeds[:n], seeds[n:], dual))
+    rates = list(system.derivative(seeds[:n], seeds[n:], functions))
     full = dual.gradients(rates, n + m, shape)
     return full[..., :n], full[..., n:]
 

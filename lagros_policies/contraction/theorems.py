@@ -35,13 +35,13 @@ from lagros_envs.dynamics import (
     System,
     control_matrix,
 )
+from lagros_envs.numbers import Interval, exact, variable
 from lagros_policies.contraction.condition import Samples, condition_left
 from lagros_policies.contraction.control import contraction_terms
 from lagros_policies.contraction.metric import DualMetric, Metric
 from lagros_policies.contraction.proof.box import ProofBox
-from lagros_policies.contraction.proof.intervals import Interval, exact, negative_definite
+from lagros_policies.contraction.proof.matrices import negative_definite
 from lagros_policies.contraction.proof.motion import accelerations, jacobian_parts, metric_series
-from lagros_policies.contraction.proof.series import variable
 from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 
 FloatArray = NDArray[np.float64]

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from lagros_envs.dynamics import (
     CartPole,
     control_matrix,
-    dual,
     hold_step,
     jacobian,
     linearise_hold,
@@ -21,6 +20,7 @@ from lagros_envs.dynamics import (
     vector_field,
 )
 from lagros_envs.dynamics.integrate import SUBSTEPS, rk4_hold
+from lagros_envs.numbers import dual, functions
 
 PERIOD = 0.1
 # Not the defaults, and all different, so that no two parameters can be mistaken for each other.
@@ -234,7 +234,7 @@ def test_floats_arrays_and_duals_give_the_same_rates(state, control):
     floats = system.derivative(tuple(state.tolist()), tuple(control.tolist()), math)
     assert all(isinstance(rate, float) for rate in floats)
     batch = vector_field(system, np.stack([state, -state]), np.stack([control, control]))
-    duals = system.derivative(dual.seed(list(state[:, None])), list(control[:, None]), dual)
+    duals = system.derivative(dual.seed(list(state[:, None])), list(control[:, None]), functions)
     np.testing.assert_allclose(batch[0], floats, rtol=1e-13, atol=1e-13)
     values = [rate.value[0] for rate in duals]
     np.testing.assert_allclose(values, floats, rtol=1e-13, atol=1e-13)
@@ -258,13 +258,13 @@ def test_duals_obey_the_rules_of_calculus(first, second, operation):
     point = {x: first, y: second}
     expected = [float(compute(x, y, sp).diff(symbol).subs(point)) for symbol in (x, y)]
     one, two = dual.seed([np.array([first]), np.array([second])])
-    result = compute(one, two, dual)
+    result = compute(one, two, functions)
     np.testing.assert_allclose(result.gradient[:, 0], expected, rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(result.value[0], float(compute(x, y, sp).subs(point)), rtol=1e-13)
-    left = compute(one, second, dual)
+    left = compute(one, second, functions)
     np.testing.assert_allclose(left.gradient[:, 0], [expected[0], 0.0], rtol=1e-13, atol=1e-13)
     if operation in "+-*/":
-        right = compute(np.array([first]), two, dual)
+        right = compute(np.array([first]), two, functions)
         np.testing.assert_allclose(right.gradient[:, 0], [0.0, expected[1]], rtol=1e-13, atol=1e-13)
 
 

@@ -18,6 +18,7 @@ import pytest
 import scipy.linalg
 
 from lagros_envs.dynamics import CartPole, Spacecraft
+from lagros_envs.numbers import exact
 from lagros_policies import contraction
 from lagros_policies.contraction import (
     CvStemSettings,
@@ -55,7 +56,7 @@ from lagros_policies.contraction.neural import training as neural_training
 from lagros_policies.contraction.proof import cartpole as proof_cartpole
 from lagros_policies.contraction.proof import condition as proof_condition
 from lagros_policies.contraction.proof import design as proof_design
-from lagros_policies.contraction.proof import hold, intervals, lifted, motion, program, rates
+from lagros_policies.contraction.proof import hold, lifted, motion, program, rates
 from lagros_policies.contraction.proof import spacecraft as proof_spacecraft
 
 Array = Any
@@ -465,7 +466,7 @@ def cartpole_calls(system: Any) -> Iterator[tuple[Callable[..., Any], Callable[[
     question = certificate_cartpole.CartPoleQuestion(BOX, 0.1, 0.0, 3.15)
     points = program.Points(samples.state, samples.nominal, samples.nominal_control)
     violation = rates.Violation(np.zeros(4), np.zeros(4), np.zeros(1))
-    angles = intervals.exact(np.zeros(3))
+    angles = exact(np.zeros(3))
     accelerations = motion.accelerations(CartPole(), angles, 2)
     whole = program.ProvedDesignSettings()
     small, design = np.full(4, 0.1), tube_design.TubeDesign()
@@ -483,7 +484,7 @@ def cartpole_calls(system: Any) -> Iterator[tuple[Callable[..., Any], Callable[[
         proof_cartpole.prove_cartpole: lambda f: f(metric, BOX, system),
         proof_design.design_proved: lambda f: f(whole, system),
         hold.HoldCondition: lambda f: f(system, metric, BOX, 0.3, 0.1),
-        lifted.LiftedCondition: lambda f: f(system, BOX, np.eye(5), intervals.exact(np.eye(5))),
+        lifted.LiftedCondition: lambda f: f(system, BOX, np.eye(5), exact(np.eye(5))),
         rates.RateCondition: lambda f: f(system, metric, BOX),
         rates.rate_condition: lambda f: f(system, metric, BOX, 0.3),
         rates.fails: lambda f: f(system, metric, violation),
@@ -583,7 +584,7 @@ GENERAL = {
     *("condition.condition_terms", "condition.condition_left", "condition.contraction_residual"),
     *("condition.verify_metric", "control.contraction_terms", "control.robust_control"),
     *("control.HeldControl", "cvstem.design_metric", "cvstem.design_on_pool", "cvstem.search_rate"),
-    *("adaptive.AdaptiveControl", "proof.intervals.interval_jacobian"),
+    *("adaptive.AdaptiveControl", "proof.matrices.interval_jacobian"),
     *("stochastic.noisy_hold_step", "theorems.gain_residual", "theorems.feasibility_residual"),
     *("theorems.contraction_distance", "adaptive.largest_gain"),
     *("systems.check_cartpole", "systems.check_spacecraft", "systems.check_sizes"),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BPoly
 
+from lagros_envs.numbers import exact
 from lagros_policies.contraction import held_ellipsoid, load_metric
 from lagros_policies.contraction.certificate_cartpole import (
     CartPoleQuestion,
@@ -25,7 +26,6 @@ from lagros_policies.contraction.held_ellipsoid import (
 )
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.proof.cells import Search, grid
-from lagros_policies.contraction.proof.intervals import exact
 from lagros_policies.contraction.proof.lifted import LiftedCondition
 from lagros_policies.contraction.statement import at_most
 from lagros_policies.contraction.tube_design import PlanBox

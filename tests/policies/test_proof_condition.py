@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import lagros_policies
 from lagros_envs.dynamics import CartPole
+from lagros_envs.numbers import Interval
 from lagros_policies.contraction import Region, Samples, contraction_residual, load_metric
 from lagros_policies.contraction.proof.cartpole import PROVED_BOX, prove_cartpole
 from lagros_policies.contraction.proof.condition import (
@@ -19,7 +20,7 @@ from lagros_policies.contraction.proof.condition import (
     prove_bounds,
     prove_contraction,
 )
-from lagros_policies.contraction.proof.intervals import Interval, negative_definite
+from lagros_policies.contraction.proof.matrices import negative_definite
 from lagros_policies.contraction.proof.rates import rate_condition
 
 PROVED = Path(lagros_policies.__file__).parent / "pretrained" / "cartpole_proved_metric.json"

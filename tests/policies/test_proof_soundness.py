@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lagros_policies
+from lagros_envs.numbers import Interval
 from lagros_policies.contraction import Metric, load_metric
 from lagros_policies.contraction.certificate_cartpole import (
     CartPoleQuestion,
@@ -23,7 +24,6 @@ from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.proof.cartpole import prove_cartpole
 from lagros_policies.contraction.proof.condition import prove_contraction
 from lagros_policies.contraction.proof.hold import HoldCondition
-from lagros_policies.contraction.proof.intervals import Interval
 from lagros_policies.contraction.proof.rates import rate_condition, triangle_tip
 from lagros_policies.contraction.statement import at_most
 from lagros_policies.contraction.tube_design import PlanBox, TubeDesign, design_contained

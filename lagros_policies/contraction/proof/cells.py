@@ -17,7 +17,8 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_policies.contraction.proof.intervals import Interval, negative_definite
+from lagros_envs.numbers import Interval
+from lagros_policies.contraction.proof.matrices import negative_definite
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -32,18 +32,13 @@ from numpy.typing import NDArray
 from lagros_envs.checks import check_at_least, check_positive
 from lagros_envs.dynamics import System
 from lagros_envs.dynamics.cartpole import ANGLE
+from lagros_envs.numbers import Interval, exact, variable
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.proof.cells import search
-from lagros_policies.contraction.proof.intervals import (
-    Interval,
-    exact,
-    interval_jacobian,
-    negative_definite,
-)
+from lagros_policies.contraction.proof.matrices import interval_jacobian, negative_definite
 from lagros_policies.contraction.proof.motion import metric_series
 from lagros_policies.contraction.proof.rates import Violation, rate_condition
-from lagros_policies.contraction.proof.series import variable
 from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 
 __all__ = [

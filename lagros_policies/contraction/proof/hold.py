@@ -27,15 +27,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_positive
-from lagros_envs.dynamics import CartPole, dual
+from lagros_envs.dynamics import CartPole
 from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_envs.dynamics.integrate import rk4_hold
+from lagros_envs.numbers import Interval, Series, dual, exact, functions, variable
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.proof.cells import Examined, grid, remainder
-from lagros_policies.contraction.proof.intervals import Interval, exact, matmul, transpose
+from lagros_policies.contraction.proof.matrices import matmul, transpose
 from lagros_policies.contraction.proof.motion import accelerations, metric_series
-from lagros_policies.contraction.proof.series import Series, variable
 from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 
 FloatArray = NDArray[np.float64]
@@ -207,7 +207,7 @@ class HoldCondition:
             seeds.append(dual.Dual(part, Series([exact(unit), *still])))
         # Nothing but the position after the hold depends on the position, and that by one.
         start = [dual.Dual(zero, seeds[0].gradient * 0.0), *seeds[:3]]
-        ended = rk4_hold(self.system, start, seeds[3:], [0.0] * 4, self.period, dual)
+        ended = rk4_hold(self.system, start, seeds[3:], [0.0] * 4, self.period, functions)
         gradient = _rows([part.gradient for part in ended])
         slope = []
         for order, block in enumerate(gradient.parts):

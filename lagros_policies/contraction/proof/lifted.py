@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from lagros_envs.dynamics import CartPole
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
+from lagros_envs.numbers import Interval, exact
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.proof.cells import Examined, grid, remainder
-from lagros_policies.contraction.proof.intervals import Interval, exact, matmul
+from lagros_policies.contraction.proof.matrices import matmul
 from lagros_policies.contraction.proof.motion import (
     accelerations,
     jacobian_parts,

@@ -17,13 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import CartPole, dual
+from lagros_envs.dynamics import CartPole
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, POSITION, VELOCITY
-from lagros_envs.dynamics.dual import Dual
+from lagros_envs.numbers import Dual, Interval, Series, exact, functions, variable
 from lagros_policies.contraction.metric import Metric
-from lagros_policies.contraction.proof import series
-from lagros_policies.contraction.proof.intervals import Interval, exact, matmul, transpose
-from lagros_policies.contraction.proof.series import Series, variable
+from lagros_policies.contraction.proof.matrices import matmul, transpose
 from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 
 FloatArray = NDArray[np.float64]
@@ -124,10 +122,10 @@ def accelerations(system: CartPole, angle: Interval, order: int) -> Acceleration
     # The slopes at f = w = 0 are a_f and a_w, without the cancellation of a difference; w^2 is so
     # large that the rest hardly widens a_q.
     seed = Dual(zero, zero + 1.0)
-    by_push = _stack([rate.gradient for rate in at(seed, zero, dual)])
-    by_rate = _stack([rate.gradient for rate in at(zero, seed, dual)])
-    still = _stack(at(0.0, 0.0, series))
-    ahead, behind = (_stack(at(0.0, rate, series)) for rate in (_FAST, -_FAST))
+    by_push = _stack([rate.gradient for rate in at(seed, zero, functions)])
+    by_rate = _stack([rate.gradient for rate in at(zero, seed, functions)])
+    still = _stack(at(0.0, 0.0, functions))
+    ahead, behind = (_stack(at(0.0, rate, functions)) for rate in (_FAST, -_FAST))
     by_square = ((ahead - still) + (behind - still)) * (0.5 / _FAST**2)
     return Accelerations(still, by_push, by_rate, by_square)
 
@@ -172,7 +170,7 @@ def metric_series(metric: Metric, angle: Series) -> Series:
     coefficients are large and of both signs, and intervals would not see that they cancel.
     """
     check_cartpole_metric(metric, "metric_series")
-    cosine = series.cos(angle)
+    cosine = functions.cos(angle)
     centre = cosine.parts[0].midpoint
     gap = _indexed(cosine - centre, (..., None, None))
     powers = [exact(np.ones((*centre.shape, 1, 1)))]

@@ -23,16 +23,11 @@ from numpy.typing import NDArray
 
 from lagros_envs.dynamics import CartPole
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
+from lagros_envs.numbers import Interval, exact, variable
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.proof.cells import Examined, grid, remainder
-from lagros_policies.contraction.proof.intervals import (
-    Interval,
-    exact,
-    interval_jacobian,
-    matmul,
-    transpose,
-)
+from lagros_policies.contraction.proof.matrices import interval_jacobian, matmul, transpose
 from lagros_policies.contraction.proof.motion import (
     JacobianParts,
     accelerations,
@@ -41,7 +36,6 @@ from lagros_policies.contraction.proof.motion import (
     metric_series,
     twice_symmetric,
 )
-from lagros_policies.contraction.proof.series import variable
 from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 
 FloatArray = NDArray[np.float64]

@@ -1,20 +1,19 @@
 """Interval arithmetic on arrays, rounded outwards: what is computed encloses what is true.
 
 An `Interval` is a number type like any other: the equations of motion run on it, and duals of
-intervals (`lagros_envs.dynamics.dual`) enclose their Jacobians. NumPy rounds + - * / to the nearest
-double, so widening each result by at least one unit in the last place encloses the exact one.
+intervals enclose their Jacobians. NumPy rounds + - * / and the square root to the nearest double,
+so widening each result by at least one unit in the last place encloses the exact one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any, Union
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import System, dual
+from lagros_envs.numbers.functions import power
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -26,17 +25,12 @@ _ULP = 2.0**-52
 _TINY = 1e-300
 # NumPy's sine and cosine are taken to err by 4 units in the last place at most, 4.5e-16 up to one.
 _SINE_ERROR = 2e-15
+# The same for its tangent and exponential, relative to the value.
+_RELATIVE_ERROR = 2e-15
 # Beyond this the reduction of the angle is not trusted and the answer is [-1, 1].
 _LARGEST_ANGLE = 1e4
 # How far the extrema of the sine are looked for outside the interval: too many only widens.
 _ANGLE_SLACK = 1e-10
-
-
-# What rounding may add to an entry of a product of three 4 by 4 matrices, relative to the product
-# of their magnitudes: it is below 16 units, of 1.1e-16 each.
-_PRODUCT_ERROR = 64 * 2.0**-52
-# The sums and products of the test itself; a bound this near to failing counts as failed.
-_SLACK = 1e-9
 
 
 class Interval:
@@ -96,23 +90,27 @@ class Interval:
 
     def __getitem__(self, index: Any) -> Interval:
         """Take a part, as of an array."""
-        return _pair(self.lower[index], self.upper[index])
+        return ordered(self.lower[index], self.upper[index])
 
     def __add__(self, other: Number) -> Interval:
         """Enclose the sums."""
-        low, high = _ends(other)
-        return _pair(_down(self.lower + low), _up(self.upper + high))
+        if not isinstance(other, _PLAIN):
+            return NotImplemented
+        low, high = ends(other)
+        return ordered(_down(self.lower + low), _up(self.upper + high))
 
     __radd__ = __add__
 
     def __neg__(self) -> Interval:
         """Change the sign, exactly."""
-        return _pair(-self.upper, -self.lower)
+        return ordered(-self.upper, -self.lower)
 
     def __sub__(self, other: Number) -> Interval:
         """Enclose the differences."""
-        low, high = _ends(other)
-        return _pair(_down(self.lower - high), _up(self.upper - low))
+        if not isinstance(other, _PLAIN):
+            return NotImplemented
+        low, high = ends(other)
+        return ordered(_down(self.lower - high), _up(self.upper - low))
 
     def __rsub__(self, other: Number) -> Interval:
         """Enclose the differences from a constant."""
@@ -120,17 +118,19 @@ class Interval:
 
     def __mul__(self, other: Number) -> Interval:
         """Enclose the products; an interval times itself is its square."""
+        if not isinstance(other, _PLAIN):
+            return NotImplemented
         if other is self:
             return self.square()
         if not isinstance(other, Interval):
             first, second = self.lower * other, self.upper * other
-            return _pair(_down(np.minimum(first, second)), _up(np.maximum(first, second)))
+            return ordered(_down(np.minimum(first, second)), _up(np.maximum(first, second)))
         low, high = other.lower, other.upper
         first, second = self.lower * low, self.lower * high
         third, fourth = self.upper * low, self.upper * high
         least = np.minimum(np.minimum(first, second), np.minimum(third, fourth))
         largest = np.maximum(np.maximum(first, second), np.maximum(third, fourth))
-        return _pair(_down(least), _up(largest))
+        return ordered(_down(least), _up(largest))
 
     __rmul__ = __mul__
 
@@ -140,10 +140,12 @@ class Interval:
         Raises:
             ZeroDivisionError: A divisor contains zero, or almost.
         """
-        low, high = _ends(other)
+        if not isinstance(other, _PLAIN):
+            return NotImplemented
+        low, high = ends(other)
         if np.any((np.asarray(low) <= _TINY) & (np.asarray(high) >= -_TINY)):
             raise ZeroDivisionError("a divisor contains zero, or almost: use smaller intervals")
-        return self * _pair(_down(1.0 / np.asarray(high)), _up(1.0 / np.asarray(low)))
+        return self * ordered(_down(1.0 / np.asarray(high)), _up(1.0 / np.asarray(low)))
 
     def __rtruediv__(self, other: Number) -> Interval:
         """Enclose the quotients of a constant."""
@@ -154,7 +156,7 @@ class Interval:
         first, second = self.lower * self.lower, self.upper * self.upper
         around = (self.lower <= 0.0) & (self.upper >= 0.0)
         least = np.where(around, 0.0, np.maximum(_down(np.minimum(first, second)), 0.0))
-        return _pair(least, _up(np.maximum(first, second)))
+        return ordered(least, _up(np.maximum(first, second)))
 
     def sin(self) -> Interval:
         """Enclose the sines of angles [rad]."""
@@ -164,110 +166,72 @@ class Interval:
         """Enclose the cosines of angles [rad]."""
         return _wave(self, np.cos, 0.0)
 
+    def tan(self) -> Interval:
+        """Enclose the tangents of angles [rad].
+
+        Raises:
+            ZeroDivisionError: An interval holds a pole, or almost, or is too far from zero.
+        """
+        unsure = np.maximum(np.abs(self.lower), np.abs(self.upper)) > _LARGEST_ANGLE
+        if np.any(unsure | _meets(self, 0.5 * math.pi) | _meets(self, 1.5 * math.pi)):
+            raise ZeroDivisionError("the tangent has a pole there, or almost: use smaller angles")
+        return _monotone(np.tan(self.lower), np.tan(self.upper))
+
+    def exp(self) -> Interval:
+        """Enclose the exponentials, which are not negative."""
+        value = _monotone(np.exp(self.lower), np.exp(self.upper))
+        return ordered(np.maximum(value.lower, 0.0), value.upper)
+
+    def sqrt(self) -> Interval:
+        """Enclose the square roots.
+
+        Raises:
+            ValueError: An interval holds negative numbers.
+        """
+        if np.any(self.lower < 0.0):
+            raise ValueError("an interval under a square root holds negative numbers")
+        least = np.maximum(_down(np.sqrt(self.lower)), 0.0)
+        return ordered(least, _up(np.sqrt(self.upper)))
+
+    def sign(self) -> Interval:
+        """Enclose the signs; an interval around zero has all from -1 to 1."""
+        return ordered(np.sign(self.lower), np.sign(self.upper))
+
+    def __abs__(self) -> Interval:
+        """Enclose the absolute values, exactly."""
+        first, second = np.abs(self.lower), np.abs(self.upper)
+        around = (self.lower <= 0.0) & (self.upper >= 0.0)
+        least = np.where(around, 0.0, np.minimum(first, second))
+        return ordered(least, np.maximum(first, second))
+
+    def __pow__(self, exponent: int) -> Any:
+        """Enclose integer powers: even ones are squares, odd ones increase."""
+        if not isinstance(exponent, int | np.integer) or exponent < 3:
+            return power(self, exponent)
+        if exponent % 2 == 0:
+            return power(self, exponent // 2).square()
+        low, high = (power(exact(end), exponent) for end in (self.lower, self.upper))
+        return ordered(low.lower, high.upper)
+
+
+# What an interval works with itself; duals and series of intervals answer in its place.
+_PLAIN = (Interval, np.ndarray, float, int, np.number)
+
 
 def exact(values: Any) -> Interval:
     """Return the intervals that hold one number each, shape (...)."""
     return _interval(np.asarray(values, float))
 
 
-def interval_jacobian(
-    system: System, state: Interval, control: Interval
-) -> tuple[Interval, Interval]:
-    """Enclose d(f + Bu)/dx and B over boxes of states and controls.
-
-    Args:
-        system: The system.
-        state: Boxes of x, shape (..., n).
-        control: Boxes of u, shape (..., m); broadcast against the state.
-
-    Returns:
-        Enclosures of d(f + Bu)/dx, shape (..., n, n), and of B(x), shape (..., n, m).
-    """
-    n, m = system.state_dim, system.control_dim
-    shape = np.broadcast_shapes(state.shape[:-1], control.shape[:-1])
-    zero = np.zeros(shape)
-    # Sums with zeros would round: broadcast the ends themselves.
-    parts: list[Any] = [
-        _pair(part.lower[..., index] + zero, part.upper[..., index] + zero)
-        for part, count in ((state, n), (control, m))
-        for index in range(count)
-    ]
-    seeds = dual.seed(parts)
-    lower, upper = np.zeros((*shape, n, n + m)), np.zeros((*shape, n, n + m))
-    for row, rate in enumerate(system.derivative(seeds[:n], seeds[n:], dual)):
-        if isinstance(rate, dual.Dual):
-            low, high = _ends(rate.gradient)
-            lower[..., row, :] = np.moveaxis(np.asarray(low), 0, -1)
-            upper[..., row, :] = np.moveaxis(np.asarray(high), 0, -1)
-    full = Interval(lower, upper)
-    return full[..., :n], full[..., n:]
-
-
-def matmul(left: Interval, right: Interval) -> Interval:
-    """Enclose the matrix products of (..., i, j) and (..., j, k), shape (..., i, k)."""
-    total = left[..., :, 0, None] * right[..., 0, None, :]
-    for index in range(1, left.shape[-1]):
-        total = total + left[..., :, index, None] * right[..., index, None, :]
-    return total
-
-
-def transpose(matrix: Interval) -> Interval:
-    """Return the transposes of matrices (..., i, j), shape (..., j, i)."""
-    return _pair(np.swapaxes(matrix.lower, -1, -2), np.swapaxes(matrix.upper, -1, -2))
-
-
-def negative_definite(matrices: Interval, added: Sequence[Interval] = ()) -> BoolArray:
-    """Return which interval matrices (..., n, n) hold only negative definite symmetric ones.
-
-    With Q from the eigenvectors of the midpoint, Q' F Q is near -I: Q' F Q = -I + E, |E| <= R. It
-    is negative definite if the spectral radius of R is below one, for which R d < d with some
-    d > 0 suffices; and then Q is regular and F is negative definite.
-
-    Args:
-        matrices: The matrices, shape (..., n, n).
-        added: Further symmetric matrices, which broadcast against these: any multiples of their
-            members by numbers from -1 to 1 may be added to the members of `matrices`.
-
-    Returns:
-        Whether that is shown, shape (...).
-    """
-    middle = matrices.midpoint
-    middle = 0.5 * (middle + np.swapaxes(middle, -1, -2))
-    usable = np.all(np.isfinite(middle), axis=(-1, -2))
-    values, vectors = np.linalg.eigh(np.where(usable[..., None, None], middle, 0.0))
-    usable &= values[..., -1] < 0.0
-    size = np.where(values < 0.0, -values, 1.0)
-    basis = vectors / np.sqrt(size)[..., None, :]
-    turned = np.swapaxes(basis, -1, -2)
-    # The radius is taken about this midpoint, whatever rounding made of it.
-    reach = np.maximum(matrices.upper - middle, middle - matrices.lower)
-    reach = np.maximum(reach, np.swapaxes(reach, -1, -2)) * (1.0 + _SLACK)
-    reach = reach + _PRODUCT_ERROR * np.abs(middle)
-    error = np.abs(turned @ middle @ basis + np.eye(middle.shape[-1]))
-    for part in added:
-        centre, radius = part.midpoint, part.radius
-        error = error + np.abs(turned @ centre @ basis)
-        reach = reach + radius * (1.0 + _SLACK) + _PRODUCT_ERROR * np.abs(centre)
-    error = error + np.abs(turned) @ reach @ np.abs(basis)
-    # What is not symmetric by rounding alone may count on either side.
-    error = np.maximum(error, np.swapaxes(error, -1, -2))
-    weight = np.ones(error.shape[:-1])
-    for _ in range(4):
-        weight = np.einsum("...ij,...j->...i", error, weight) + 1e-3 * weight
-        weight /= weight.max(axis=-1, keepdims=True)
-    bound = np.einsum("...ij,...j->...i", error, weight)
-    proved: BoolArray = usable & np.all(bound < weight * (1.0 - _SLACK), axis=-1)
-    return proved
-
-
-def _pair(lower: Any, upper: Any) -> Interval:
-    # Without the check of the constructor, for ends that are ordered by construction.
+def ordered(lower: Any, upper: Any) -> Interval:
+    """Pair ends that are ordered by construction: the check of the constructor is left out."""
     value = Interval.__new__(Interval)
     value.lower, value.upper = lower, upper
     return value
 
 
-def _ends(value: Number) -> tuple[Any, Any]:
+def ends(value: Number) -> tuple[Any, Any]:
+    """Return lower and upper ends; a number is both."""
     return (value.lower, value.upper) if isinstance(value, Interval) else (value, value)
 
 
@@ -275,7 +239,7 @@ def _interval(value: Number) -> Interval:
     if isinstance(value, Interval):
         return value
     array = np.asarray(value, dtype=np.float64)
-    return _pair(array, array)
+    return ordered(array, array)
 
 
 def _down(value: Any) -> Any:
@@ -293,7 +257,7 @@ def _wave(angle: Interval, function: Any, peak: float) -> Interval:
     unsure = np.maximum(np.abs(angle.lower), np.abs(angle.upper)) > _LARGEST_ANGLE
     largest = np.where(unsure | _meets(angle, peak), 1.0, largest + _SINE_ERROR)
     least = np.where(unsure | _meets(angle, peak + math.pi), -1.0, least - _SINE_ERROR)
-    return _pair(np.maximum(least, -1.0), np.minimum(largest, 1.0))
+    return ordered(np.maximum(least, -1.0), np.minimum(largest, 1.0))
 
 
 def _meets(angle: Interval, place: float) -> BoolArray:
@@ -304,6 +268,13 @@ def _meets(angle: Interval, place: float) -> BoolArray:
     return found
 
 
+def _monotone(low: Any, high: Any) -> Interval:
+    """Enclose an increasing function that NumPy rounds well enough at both ends."""
+    return ordered(
+        _down(low - _RELATIVE_ERROR * np.abs(low)), _up(high + _RELATIVE_ERROR * np.abs(high))
+    )
+
+
 _UFUNCS: dict[Any, Any] = {
     np.add: lambda a, b: a + b,
     np.subtract: lambda a, b: a - b,
@@ -311,6 +282,10 @@ _UFUNCS: dict[Any, Any] = {
     np.true_divide: lambda a, b: a / b,
     np.negative: lambda a: -a,
     np.square: Interval.square,
+    np.absolute: abs,
     np.sin: Interval.sin,
     np.cos: Interval.cos,
+    np.tan: Interval.tan,
+    np.exp: Interval.exp,
+    np.sqrt: Interval.sqrt,
 }

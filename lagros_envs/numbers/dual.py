@@ -1,17 +1,17 @@
 """Dual numbers: forward-mode derivatives of a function written for scalars.
 
-A `Dual` carries a value and its gradient along k seed directions. Passing duals and this module
-as the namespace of elementary functions through an equation of motion gives its exact Jacobian,
-so that no derivative of the physics is written by hand.
+A `Dual` carries a value and its gradient along k seed directions. Passing duals through an equation
+of motion gives its exact Jacobian, so that no derivative of the physics is written by hand.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any, Union
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lagros_envs.numbers.functions import cos, exp, power, sin, sqrt, tan
 
 FloatArray = NDArray[np.float64]
 Number = Union["Dual", FloatArray, float]
@@ -78,26 +78,41 @@ class Dual:
         quotient = other / self.value
         return Dual(quotient, -self.gradient * (quotient / self.value))
 
+    def __pow__(self, exponent: int) -> Any:
+        """Power rule, for integers."""
+        return power(self, exponent)
 
-def sin(angle: Number) -> Any:
-    """Return the sine of a dual, or of a number that does not depend on the seeds."""
-    if not isinstance(angle, Dual):
-        return _functions(angle).sin(angle)
-    functions = _functions(angle.value)
-    return Dual(functions.sin(angle.value), angle.gradient * functions.cos(angle.value))
+    def __abs__(self) -> Dual:
+        """Follow the sign; the derivative at zero is taken as zero."""
+        return Dual(abs(self.value), self.gradient * _sign(self.value))
+
+    def sin(self) -> Dual:
+        """Chain rule of the sine."""
+        return Dual(sin(self.value), self.gradient * cos(self.value))
+
+    def cos(self) -> Dual:
+        """Chain rule of the cosine."""
+        return Dual(cos(self.value), self.gradient * -sin(self.value))
+
+    def tan(self) -> Dual:
+        """Chain rule of the tangent."""
+        value = tan(self.value)
+        return Dual(value, self.gradient * (1.0 + value * value))
+
+    def exp(self) -> Dual:
+        """Chain rule of the exponential."""
+        value = exp(self.value)
+        return Dual(value, self.gradient * value)
+
+    def sqrt(self) -> Dual:
+        """Chain rule of the square root."""
+        value = sqrt(self.value)
+        return Dual(value, self.gradient / (2.0 * value))
 
 
-def cos(angle: Number) -> Any:
-    """Return the cosine of a dual, or of a number that does not depend on the seeds."""
-    if not isinstance(angle, Dual):
-        return _functions(angle).cos(angle)
-    functions = _functions(angle.value)
-    return Dual(functions.cos(angle.value), angle.gradient * -functions.sin(angle.value))
-
-
-def _functions(value: FloatArray | float) -> Any:
-    # `math` is ten times faster than NumPy on one number.
-    return math if isinstance(value, float) else np
+def _sign(value: Any) -> Any:
+    own = getattr(value, "sign", None)
+    return np.sign(value) if own is None else own()
 
 
 def seed(arrays: list[FloatArray]) -> list[Dual]:

@@ -1,7 +1,7 @@
 """Taylor series in one variable with interval coefficients: enclosures of higher derivatives.
 
 A `Series` is a number type like `dual.Dual`: the equations of motion run on it, and duals of series
-enclose the derivatives of a Jacobian. This module is its namespace of elementary functions.
+enclose the derivatives of a Jacobian.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from typing import Any, Union
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics.dual import Dual
-from lagros_policies.contraction.proof.intervals import Interval, exact
+from lagros_envs.numbers.dual import Dual
+from lagros_envs.numbers.functions import power
+from lagros_envs.numbers.interval import Interval, exact
 
 FloatArray = NDArray[np.float64]
 Number = Union["Series", Dual, Interval, FloatArray, float]
@@ -103,21 +104,56 @@ class Series:
         """Divide a constant."""
         return _constant(other, self) / self
 
+    def __pow__(self, exponent: int) -> Any:
+        """Raise to an integer power."""
+        return power(self, exponent)
+
+    def __abs__(self) -> Series:
+        """Return the series itself or its negative.
+
+        Raises:
+            ValueError: The function may be zero, where its absolute value has no derivative.
+        """
+        sign = self.parts[0].sign()
+        if np.any(sign.lower * sign.upper <= 0.0):
+            raise ValueError("abs of a series around zero has no derivative: use smaller intervals")
+        return Series([part * sign.lower for part in self.parts])
+
+    def sin(self) -> Series:
+        """Return the sine."""
+        return _waves(self)[0]
+
+    def cos(self) -> Series:
+        """Return the cosine."""
+        return _waves(self)[1]
+
+    def tan(self) -> Series:
+        """Return the tangent."""
+        sine, cosine = _waves(self)
+        return sine / cosine
+
+    def exp(self) -> Series:
+        """Return the exponential, from e' = a' e."""
+        slopes, values = self.differentiated().parts, [self.parts[0].exp()]
+        for k in range(1, len(self.parts)):
+            values.append(_cross(slopes, values, k - 1) / float(k))
+        return Series(values)
+
+    def sqrt(self) -> Series:
+        """Return the square root, from s s = a."""
+        roots = [self.parts[0].sqrt()]
+        for k in range(1, len(self.parts)):
+            known = self.parts[k]
+            for j in range(1, k):
+                known = known - roots[j] * roots[k - j]
+            roots.append(known / (roots[0] * 2.0))
+        return Series(roots)
+
 
 def variable(place: Interval, order: int) -> Series:
     """Return the variable itself, near points or over intervals, up to an order of at least 1."""
     zero = exact(np.zeros(place.shape))
     return Series([place, zero + 1.0, *[zero] * (order - 1)])
-
-
-def sin(angle: Any) -> Any:
-    """Return the sine of a series, or of a number that does not depend on the variable."""
-    return _waves(angle)[0] if isinstance(angle, Series) else np.sin(angle)
-
-
-def cos(angle: Any) -> Any:
-    """Return the cosine of a series, or of a number that does not depend on the variable."""
-    return _waves(angle)[1] if isinstance(angle, Series) else np.cos(angle)
 
 
 def _waves(angle: Series) -> tuple[Series, Series]:
@@ -148,6 +184,12 @@ _UFUNCS: dict[Any, Any] = {
     np.add: lambda a, b: a + b,
     np.subtract: lambda a, b: a - b,
     np.multiply: lambda a, b: a * b,
-    np.sin: sin,
-    np.cos: cos,
+    np.true_divide: lambda a, b: a / b,
+    np.negative: lambda a: -a,
+    np.absolute: abs,
+    np.sin: Series.sin,
+    np.cos: Series.cos,
+    np.tan: Series.tan,
+    np.exp: Series.exp,
+    np.sqrt: Series.sqrt,
 }
