@@ -116,7 +116,10 @@ def is_file(path: Path) -> bool:
 
 
 def listed_names(text: str) -> tuple[str, ...]:
-    """Split a list of policies at its commas, except within the name of a file that is there."""
+    """Split a list of policies at its commas, except within the name of a file that is there.
+
+    An empty entry stays one.
+    """
     parts = text.split(",")
     return tuple(_names(parts))
 
@@ -128,8 +131,7 @@ def _names(parts: list[str]) -> Iterator[str]:
         whole = (",".join(parts[at:end]) for end in range(last, at, -1))
         found = next((name for name in whole if _existing_model(name) is not None), None)
         if found is None:
-            if parts[at].strip():
-                yield parts[at].strip()
+            yield parts[at].strip()
             at += 1
         else:
             yield found

@@ -22,6 +22,7 @@ from lagros_benchmarks.library import (
     SetupError,
     Toolbox,
     building,
+    check_observes,
     describe_error,
 )
 from lagros_benchmarks.settings import BenchmarkSettings, Case, Condition
@@ -179,6 +180,7 @@ def make_policy(
     """
     with building(f"policy {name!r}"):
         policy = toolbox.make_policy(name, env, settings.policy_settings.get(name, {}))
+    check_observes(f"policy {name!r}", policy)
     observation, _ = env.reset(seed=0, options=_standing_still(env))
     rehearse(f"policy {name!r}", policy, observation, [True], ACTION)
     return policy

@@ -103,6 +103,9 @@ def _times(run: CartPoleRun, case: Case) -> Row:
         **alone,
         "step_time_episodes": len(timed),
         "step_time_while_contended": contended,
+        "timing_raised": 0
+        if contended is None
+        else sum(record.error is not None for record in timed),
         "forward_time_median_s": run.forward_times[case.policy],
         "deadline_s": run.control_period,
     }

@@ -7,7 +7,7 @@ inside it, so that `lagros --help` answers at once.
 from __future__ import annotations
 
 import sys
-from contextlib import redirect_stdout
+from contextlib import chdir, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -178,7 +178,7 @@ def bench(
             raise ValueError(f"--replan-every is for cartpole; leave it out for {task}")
         settings = BenchmarkSettings.for_task(
             task,
-            policies=named,
+            policies=listed_or_none(named, str, "--policies"),
             policy_settings=None
             if replan_every is None
             else {"tube-mpc": {"replan_every": replan_every}},
@@ -326,8 +326,8 @@ def run_and_report(
     if len(kept):
         progress_line(f"going on with {len(kept)} finished chunks of {kept.folder}")
     try:
-        # What policies print is not ours.
-        with progress_bar() as progress, redirect_stdout(sys.stderr):
+        # What policies print is not ours, and where they go is no matter.
+        with progress_bar() as progress, redirect_stdout(sys.stderr), chdir("."):
             run = run_benchmark(settings, progress=progress, kept=kept)
     except (SetupError, BackendError) as error:
         # No weights, damaged weights, an extra that is not installed, a cluster that is not there.
@@ -344,9 +344,11 @@ def run_and_report(
         if folder == BENCH_FOLDER:
             remove_folders((folder.parent, folder))
     delivery.tell()
-    if any(row["raised"] for row in rows):
-        raised = [(row["policy"], row["raised"], row["episodes"]) for row in rows if row["raised"]]
-        typer.echo(f"lagros: {raised_line(raised)}", err=True)
+    raised = raised_line((row["policy"], row["raised"], row["episodes"]) for row in rows)
+    if not raised and any(row["timing_raised"] for row in rows):
+        raised = f"episodes raised where Δt was measured; exit status {RAISED}"
+    if raised:
+        typer.echo(f"lagros: {raised}", err=True)
         raise typer.Exit(RAISED)
     return rows
 

@@ -9,7 +9,7 @@ A call that never returns is waited for: there is no time limit on a policy.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Iterable
 from time import perf_counter
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -97,8 +97,9 @@ def ask(
         ValueError: A number of it is not finite.
     """
     seen, first = np.array(observation), np.array(starts)
-    begin = perf_counter()
-    answer = policy.predict(seen, state, first, True)
+    with np.errstate():  # a policy may set what NumPy raises, for itself
+        begin = perf_counter()
+        answer = policy.predict(seen, state, first, True)
     if not isinstance(answer, tuple | list) or len(answer) != 2:
         raise AnswerError(
             f"predict returned {_said(answer)}; it must return a pair, the action and its memory "
@@ -219,11 +220,18 @@ def check_interface(what: str, policy: Any) -> None:
         ) from None
 
 
-def raised_line(raised: Sequence[tuple[str, int, int]]) -> str:
-    """Return what a command says at its end of the episodes that raised.
+def raised_line(raised: Iterable[tuple[str, int, int]]) -> str:
+    """Return what a command says at its end of the episodes that raised; "" if none did.
 
     Args:
-        raised: Name, number of episodes that raised and number of all, of each policy.
+        raised: Name of the policy, number of episodes that raised and number of all, of each row.
     """
-    parts = [f"{name}: {count} of {total}" for name, count, total in raised]
+    counts: dict[str, list[int]] = {}
+    for name, count, total in raised:
+        before = counts.setdefault(name, [0, 0])
+        before[0] += count
+        before[1] += total
+    parts = [f"{name}: {count} of {total}" for name, (count, total) in counts.items() if count]
+    if not parts:
+        return ""
     return f"episodes raised and count as failures ({'; '.join(parts)}); exit status {RAISED}"

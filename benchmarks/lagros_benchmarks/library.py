@@ -7,7 +7,7 @@ imports only what its chunk needs.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
@@ -53,6 +53,22 @@ class SetupError(Exception):
         return cls(own if own.startswith(what) else f"{what} cannot be built: {text}")
 
 
+def check_observes(what: str, policy: Any) -> None:
+    """Check that a policy says rightly what it is fed, where it says it.
+
+    Args:
+        what: As for `SetupError.building`.
+        policy: The policy.
+
+    Raises:
+        SetupError: It does not.
+    """
+    with building(what):
+        observes = getattr(policy, "observes", "local")
+        if observes not in ("local", "global"):
+            raise SetupError(f'{what} has observes={observes!r}; it must be "local" or "global"')
+
+
 @contextmanager
 def building(what: str) -> Iterator[None]:
     """Turn whatever the constructor of a stranger raises, SystemExit too, into a `SetupError`.
@@ -64,7 +80,8 @@ def building(what: str) -> Iterator[None]:
         SetupError: Something was raised.
     """
     try:
-        yield
+        with chdir("."):  # where a constructor goes, it goes for itself
+            yield
     except (KeyboardInterrupt, SetupError):
         raise
     except BaseException as error:
@@ -142,14 +159,17 @@ def make_single_policy(name: str, env: Any) -> Policy:
     """Build the policy of a command that flies one.
 
     Raises:
-        SetupError: It is a class of the user's own, and its constructor raises.
+        SetupError: It is a class of the user's own, and its constructor raises, or it does not say
+            rightly what it observes.
         ValueError: The name is unknown, or the file is not valid.
         OSError: A file cannot be read.
         ImportError: An extra that the policy needs is not installed.
     """
     try:
-        return make_policy(name, env, {})
-    except (ValueError, OSError, ImportError, KeyboardInterrupt):
+        policy = make_policy(name, env, {})
+        check_observes(f"policy {name!r}", policy)
+        return policy
+    except (SetupError, ValueError, OSError, ImportError, KeyboardInterrupt):
         raise
     except BaseException as error:
         raise SetupError.building(f"policy {name!r}", error) from error

@@ -23,6 +23,8 @@ from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
 BoolArray = NDArray[np.bool_]
 Float32Array = NDArray[np.float32]
 
+# Memories of a policy within those of what it wears.
+_MOST_WRAPPED = 4
 _MEASURES = (
     *("success", "success_time", "strict_success", "paper_success", "collided", "collision_time"),
     *("effort", "effort_to_success", "goal_distance"),
@@ -295,7 +297,9 @@ def plans_of(state: Any) -> Sequence[Any] | None:
 
     A safety filter wraps the memory of its policy in its own, as the first entry.
     """
-    while isinstance(state, list | tuple) and state:
+    for _ in range(_MOST_WRAPPED):
+        if not (isinstance(state, list | tuple) and state):
+            return None
         if all(hasattr(entry, "nominal") and hasattr(entry, "solved") for entry in state):
             return state
         state = state[0]

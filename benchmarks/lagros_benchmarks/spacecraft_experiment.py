@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from lagros_benchmarks.episodes import added_up
 from lagros_benchmarks.experiment import BenchmarkRun
 from lagros_benchmarks.flying import check_interface
-from lagros_benchmarks.library import FloatArray, Policy, Toolbox, building
+from lagros_benchmarks.library import FloatArray, Policy, Toolbox, building, check_observes
 from lagros_benchmarks.settings import BenchmarkSettings, Case
 from lagros_benchmarks.spacecraft_episodes import (
     Flight,
@@ -137,6 +137,7 @@ class SpacecraftExperiment:
         given = self.settings.policy_settings.get(name, {})
         with building(f"policy {name!r}"):
             policy = self.toolbox.make_policy(name, env, given)
+        check_observes(f"policy {name!r}", policy)
         if not case.safety_filter:
             return policy
         check_interface(f"policy {name!r}", policy)
@@ -167,7 +168,7 @@ class SpacecraftExperiment:
             return [timing]
         further = self.settings.episode_seeds()[len(units) : PLAN_WORLDS]
         plans = np.concatenate([timing.plans, time_plans(env, policy, further)])
-        return [Timing(timing.steps, timing.batches, plans, timing.agents)]
+        return [replace(timing, plans=plans)]
 
     def finish(
         self,

@@ -163,6 +163,7 @@ def _times(timings: Sequence[Timing], deadline: float) -> Row:
         "plan_time_max_s": planning.maximum if plans.size else None,
         "plans_timed": int(plans.size),
         "steps_timed": int(steps.size),
+        "timing_raised": sum(timing.raised for timing in timings),
         "deadline_s": deadline,
         "deadline_misses": step_time_statistics(calls, misses).deadline_misses,
     }

@@ -28,12 +28,14 @@ class Timing:
         batches: Calls for all agents of a world together, at every step.
         plans: First calls of a policy for all agents together, which plans in them; else empty.
         agents: Agents of a world.
+        raised: Episodes whose times end with an exception.
     """
 
     steps: FloatArray
     batches: FloatArray
     plans: FloatArray
     agents: int
+    raised: int
 
 
 def time_policy(env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int]) -> Timing:
@@ -41,7 +43,7 @@ def time_policy(env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int]) 
 
     A local policy is called twice at every step: for all agents of the world, which flies it, and
     for one of them alone with a memory of its own, as it would run on board. The agent changes from
-    world to world. What raises ends the times of its episode; the records have its text.
+    world to world. What raises ends the times of its episode, and is counted.
 
     Args:
         env: One world, without autoreset.
@@ -54,18 +56,20 @@ def time_policy(env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int]) 
     steps: list[float] = []
     batches: list[float] = []
     plans: list[float] = []
+    raised = 0
     for index, seed in enumerate(seeds):
         alone = None if is_global(policy) else index % env.num_agents
         times = _WorldTimes([], [])
-        with Attempt():
+        with Attempt() as attempt:
             _time_world(env, policy, seed, alone, times)
+        raised += attempt.error is not None
         batches += times.batches
         if alone is None:
             plans += times.batches[:1]
             steps += times.batches[1:]
         else:
             steps += times.alone
-    return Timing(np.array(steps), np.array(batches), np.array(plans), env.num_agents)
+    return Timing(np.array(steps), np.array(batches), np.array(plans), env.num_agents, raised)
 
 
 def time_plans(env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int]) -> FloatArray:

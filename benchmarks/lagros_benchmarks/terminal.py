@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
@@ -149,14 +149,22 @@ def find_users_modules(policies: Iterable[str]) -> None:
         sys.path.append(here)
 
 
-def listed(text: str, convert: Callable[[str], Value], option: str) -> tuple[Value, ...]:
+def listed(
+    text: str | Sequence[str], convert: Callable[[str], Value], option: str
+) -> tuple[Value, ...]:
     """Split a comma-separated option.
+
+    Args:
+        text: The option; or its entries, where it is not split at every comma.
+        convert: Makes a value of an entry.
+        option: Its name.
 
     Raises:
         ValueError: An entry is empty, or cannot be converted.
     """
     values = []
-    for entry in (part.strip() for part in text.split(",")):
+    entries = [part.strip() for part in text.split(",")] if isinstance(text, str) else text
+    for entry in entries:
         shown = repr(entry if len(entry) <= _SHOWN else f"{entry[:_SHOWN]}…")
         if not entry:
             raise ValueError(f"{option}: an entry is empty; write them as a,b without a comma more")
@@ -169,7 +177,7 @@ def listed(text: str, convert: Callable[[str], Value], option: str) -> tuple[Val
 
 
 def listed_or_none(
-    text: str | None, convert: Callable[[str], Value], option: str
+    text: str | Sequence[str] | None, convert: Callable[[str], Value], option: str
 ) -> tuple[Value, ...] | None:
     """Split a comma-separated option that may be left out; see `listed`."""
     return None if text is None else listed(text, convert, option)

@@ -107,7 +107,7 @@ def gave_up(deaths: int, error: Exception) -> BackendError:
     """Return the error that ends a run whose chunk lost so many workers."""
     return BackendError(
         f"a chunk of work lost its worker {deaths} times ({type(error).__name__}); most often the "
-        "memory is too small: take fewer jobs"
+        "memory is too small: take fewer jobs; or what it runs ends its own process"
     )
 
 

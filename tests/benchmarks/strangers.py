@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 
 # Actions of nothing: one number of the cart-pole, eight thrusts of every spacecraft.
@@ -184,7 +186,38 @@ class AlwaysRaises(Calm):
         raise ArithmeticError("never")
 
 
+class Misnamed(Calm):
+    observes = "gobal"
+
+
+class Unreadable(Calm):
+    @property
+    def observes(self):
+        raise RuntimeError("not now")
+
+
+class Alone(Calm):
+    """Raises where it is asked for one agent alone, as for its time."""
+
+    def answer(self, seen, zero):
+        if self.wide and len(seen) == 1:
+            raise ArithmeticError("not alone")
+        return zero, None
+
+
+class Wanders(Calm):
+    """Goes to another folder, and makes NumPy raise, for the rest of the process."""
+
+    def __init__(self, settings, **others):
+        super().__init__(settings, **others)
+        os.chdir("/")
+
+    def answer(self, seen, zero):
+        np.seterr(all="raise")
+        return zero, [self]  # and its memory holds itself
+
+
 UNFIT = (NoPredict, NoKeywords, Unbuilt, Exits, NoPackage, NoPair, Triple, Nothing, Words, Wide)
-UNFIT += (Masked,)
+UNFIT += (Masked, Misnamed, Unreadable)
 FAILING = (Raises, Leaves, Closes, Recurses, Fills, Unspeakable, NotANumber, Infinite)
 FAILING += (LateNothing, LateTriple, LateWords, LateWide, AlwaysRaises)

@@ -94,8 +94,8 @@ def rows():
         agents=(2,),
         safety_filter="both",
     )
-    local = Timing(np.array([0.01, 0.02, 0.3]), np.array([0.02, 0.04, 0.06]), np.array([]), 2)
-    joint = Timing(np.array([0.01, 0.03]), np.array([0.5, 0.01, 0.03]), np.array([0.5, 1.5]), 2)
+    local = Timing(np.array([0.01, 0.02, 0.3]), np.array([0.02, 0.04, 0.06]), np.array([]), 2, 0)
+    joint = Timing(np.array([0.01, 0.03]), np.array([0.5, 0.01, 0.03]), np.array([0.5, 1.5]), 2, 0)
     worlds = {"ours": OURS, "theirs": THEIRS, "joint": PLANNED}
     episodes = {case: worlds[case.policy] for case in settings.cases}
     # The filter turns our second world into a success.

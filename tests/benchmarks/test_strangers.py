@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -114,6 +115,30 @@ def test_what_a_policy_does_to_its_observations_changes_nothing(task, jobs):
             np.testing.assert_array_equal(one.tracking_error, two.tracking_error)
         else:
             assert one == two
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_workers_tell_of_what_raised(invoke, tmp_path, task):
+    result = invoke(*bench(task, strangers.Leaves), "--jobs", "2")
+    assert result.exit_code == 3, result.output
+    assert json.loads((tmp_path / "out.json").read_text())[0]["raised"] == 1
+
+
+def test_what_raises_only_where_it_is_timed_is_told(invoke, tmp_path):
+    result = invoke(*bench("spacecraft", strangers.Alone))
+    assert result.exit_code == 3, result.output
+    (row,) = json.loads((tmp_path / "out.json").read_text())
+    assert (row["raised"], row["timing_raised"], row["steps_timed"]) == (0, 1, 0)
+    assert "! Alone, uniform 0.3: 1 worlds raised where Δt was measured" in result.stdout
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_policy_leaves_nothing_behind_in_the_process(invoke, tmp_path, task):
+    before = np.geterr()
+    assert invoke(*bench(task, strangers.Wanders)).exit_code == 0
+    assert (tmp_path / "out.json").is_file()
+    assert os.path.samefile(".", tmp_path)
+    assert np.geterr() == before
 
 
 def test_counters_that_raise_fail_their_episode(invoke, tmp_path):
