@@ -49,17 +49,13 @@ def write_atomic(path: str | Path, data: str | bytes) -> Path:
     """
     given = Path(path)
     content = data.encode(errors="backslashreplace") if isinstance(data, str) else data
-    status = _status(given)
-    descriptor = _own_descriptor(given, status)
-    if descriptor is not None:
-        for stream in (sys.stdout, sys.stderr):
-            if stream is not None:
-                stream.flush()
-        _write_all(descriptor, content)
-    elif status is None or stat.S_ISREG(status.st_mode):
-        _replace(Path(os.path.realpath(given)), content, status)
-    else:
-        _write_into(given, content, _special(given, status))
+    try:
+        _write(given, content)
+    except OSError as error:
+        if error.errno is None or error.filename is not None:
+            raise
+        # What fails on an open file does not say on which.
+        raise OSError(error.errno, error.strerror, str(given)) from error
     return given
 
 
@@ -119,6 +115,20 @@ def remove_folders(folders: tuple[Path, ...]) -> None:
     for folder in reversed(folders):
         with contextlib.suppress(OSError):
             folder.rmdir()
+
+
+def _write(given: Path, content: bytes) -> None:
+    status = _status(given)
+    descriptor = _own_descriptor(given, status)
+    if descriptor is not None:
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:
+                stream.flush()
+        _write_all(descriptor, content)
+    elif status is None or stat.S_ISREG(status.st_mode):
+        _replace(Path(os.path.realpath(given)), content, status)
+    else:
+        _write_into(given, content, _special(given, status))
 
 
 def _status(path: Path) -> os.stat_result | None:

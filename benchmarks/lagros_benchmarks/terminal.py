@@ -37,6 +37,8 @@ _SHOWN = 60  # letters of an entry in a message
 def fail(error: Exception | str, status: int = USAGE_ERROR) -> NoReturn:
     """Say what is wrong, without a traceback, and end with the exit status."""
     text = _named_by_option(str(error))
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        text = f"{error.filename}: {error.strerror}"
     if isinstance(error, Exception) and "pip install" not in text:
         text += install_hint(error)
     typer.echo(f"lagros: {text}", err=True)
@@ -195,13 +197,16 @@ def progress_bar() -> Iterator[Progress]:
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
+    console = Console(stderr=True)
     with Bar(
         TextColumn("{task.description:<9}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        console=Console(stderr=True),
+        console=console,
         transient=True,
+        # Where nothing moves, all that would be left of it is an empty line.
+        disable=not console.is_terminal,
     ) as bar:
         tasks: dict[str, Any] = {}
 
