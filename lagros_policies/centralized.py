@@ -77,6 +77,7 @@ class CentralizedState:
 
     Attributes:
         plan: The plan, solved or not; None if too little time was left to ask for one.
+        starts: Positions from which it was made, shape (agents, 2) [m].
         goals: The goals that it was made for, shape (agents, 2) [m].
         nominal: x_d at every control instant of the episode, shape (steps + 1, agents, 6); at rest
             after the plan's end, and all the time where it failed. An environment takes it as
@@ -85,6 +86,7 @@ class CentralizedState:
     """
 
     plan: JointPlan | None
+    starts: FloatArray
     goals: FloatArray
     nominal: FloatArray
     accelerations: FloatArray
@@ -184,10 +186,10 @@ class CentralizedPolicy:
         worlds = WorldState.of(self.agents, self.obstacles, observation)
         count = len(worlds.time)
         memories: list[CentralizedState | None] = row_memories(
-            state, episode_start, count, "worlds"
+            state, episode_start, count, "worlds", CentralizedState
         )
         following = [
-            self._start(worlds, world) if memory is None else _same(worlds.goals[world], memory)
+            self._start(worlds, world) if memory is None else _same(worlds, world, memory)
             for world, memory in enumerate(memories)
         ]
         steps = [self._step(time) for time in worlds.time.tolist()]
@@ -245,14 +247,17 @@ class CentralizedPolicy:
             nominal[end + 1 :] = reference[:, -1]
             nominal[end:, :, 3:] = 0.0
             accelerations[first:end] = pushes.transpose(1, 0, 2)
-        return CentralizedState(plan, goals, nominal, accelerations)
+        return CentralizedState(plan, states[:, :2].copy(), goals, nominal, accelerations)
 
 
-def _same(goals: FloatArray, memory: CentralizedState) -> CentralizedState:
-    """Return the memory, if it is of an episode with these goals."""
-    if not np.array_equal(goals, memory.goals):
+def _same(worlds: WorldState, world: int, memory: CentralizedState) -> CentralizedState:
+    """Return the memory, if it is of an episode with these goals, and these starts at its start."""
+    starts = worlds.states[world, :, :2] if worlds.time[world] == 0.0 else memory.starts
+    if not (
+        np.array_equal(worlds.goals[world], memory.goals) and np.array_equal(starts, memory.starts)
+    ):
         raise ValueError(
-            "the state is of an episode with other goals; pass state=None, or episode_start, "
-            "when an episode starts"
+            "the state is of an episode with other starts or goals; pass state=None, or "
+            "episode_start, when an episode starts"
         )
     return memory

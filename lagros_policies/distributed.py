@@ -179,7 +179,7 @@ class DistributedTubeMpcPolicy:
         sensed = Sensed.of(self.layout, observation)
         count = len(sensed.time)
         memories: list[DistributedState | None] = row_memories(
-            state, episode_start, count, "agents"
+            state, episode_start, count, "agents", DistributedState
         )
         # Copies: what was returned before stays what it was.
         following = [

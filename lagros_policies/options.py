@@ -148,7 +148,7 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
     ) -> tuple[Float32Array, PolicyState]:
         """Plan, learn and track; see `Policy.predict`. The state is one per row."""
         count = len(np.atleast_2d(cartpole_rows(observation, np.float64)))
-        memories = row_memories(state, episode_start, count, "episodes")
+        memories = row_memories(state, episode_start, count, "episodes", AdaptiveState)
         fresh = [AdaptiveState() if memory is None else memory for memory in memories]
         return super().predict(observation, fresh, None, deterministic)
 

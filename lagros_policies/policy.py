@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 from collections.abc import Callable
-from typing import Any, Literal, Protocol, cast, runtime_checkable
+from typing import Any, Literal, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,9 +69,16 @@ class Policy(Protocol):
         """
 
 
+Memory = TypeVar("Memory")
+
+
 def row_memories(
-    state: PolicyState, episode_start: NDArray[np.bool_] | None, count: int, rows: str
-) -> list[Any]:
+    state: PolicyState,
+    episode_start: NDArray[np.bool_] | None,
+    count: int,
+    rows: str,
+    kind: type[Memory],
+) -> list[Memory | None]:
     """Return what is remembered of each row of an observation, None where its episode starts.
 
     Args:
@@ -79,11 +86,20 @@ def row_memories(
         episode_start: Which rows start an episode, shape (count,); None if none does.
         count: Number of rows observed.
         rows: What a row is, in the plural, for the message.
+        kind: Of the memories.
 
     Raises:
-        ValueError: Memories, starts and rows are not equally many.
+        ValueError: Memories, starts and rows are not equally many, or the memories are another
+            policy's.
     """
-    memories = [None] * count if state is None else list(state)
+    memories = [None] * count if state is None else state
+    if not isinstance(memories, list | tuple) or not all(
+        memory is None or isinstance(memory, kind) for memory in memories
+    ):
+        raise ValueError(
+            f"state must be what predict returned last, a {kind.__name__} for each of the {rows}, "
+            "or None at the start of an episode"
+        )
     starts = np.zeros(count, bool) if episode_start is None else np.ravel(episode_start)
     if len(memories) != count or len(starts) != count:
         raise ValueError(

@@ -41,6 +41,7 @@ class TubeMpcState:
         plans: Plans asked for.
         failed_plans: Plans that did not hold; the last one stayed in force.
         late_plans: Plans that took longer than the deadline; the last one stayed in force.
+        newest: Control step of the last call; -1 before the first.
     """
 
     plan: Trajectory | None = None
@@ -49,6 +50,7 @@ class TubeMpcState:
     plans: int = 0
     failed_plans: int = 0
     late_plans: int = 0
+    newest: int = -1
 
 
 class TubeMpcPolicy:
@@ -115,7 +117,7 @@ class TubeMpcPolicy:
         """
         rows = np.atleast_2d(cartpole_rows(observation, np.float64))
         memories: list[TubeMpcState | None] = row_memories(
-            state, episode_start, len(rows), "episodes"
+            state, episode_start, len(rows), "episodes", TubeMpcState
         )
         # Copies: what was returned before stays what it was.
         fresh = [TubeMpcState() if memory is None else copy(memory) for memory in memories]
@@ -133,6 +135,12 @@ class TubeMpcPolicy:
     def _force(self, row: FloatArray, memory: TubeMpcState) -> FloatArray:
         settings = self.settings
         step = round(float(row[task.TIME]) / settings.control_period)
+        if step < memory.newest:
+            raise ValueError(
+                f"the time went back from step {memory.newest} to {step}: pass state=None, or "
+                "episode_start, when an episode starts"
+            )
+        memory.newest = step
         # Past the time limit the plan has ended: hold its last nominal state.
         step = min(step, settings.steps - 1)
         goal = row[task.GOAL]

@@ -322,7 +322,7 @@ def test_memories_of_something_else_get_a_clear_error():
     with pytest.raises(ValueError, match="episode_start is for 2"):
         policy.predict(state, memory, np.zeros(2, bool))
     env.reset(seed=1)
-    with pytest.raises(ValueError, match="other goals"):
+    with pytest.raises(ValueError, match="other starts or goals"):
         policy.predict(env.state(), memory)
 
 

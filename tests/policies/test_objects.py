@@ -220,3 +220,33 @@ def test_settings_are_written_as_json_and_copied(kind):
         assert hash(twin) == hash(settings)
     if kind is CartPoleSettings:
         assert CartPole(**json.loads(text)["system"]) == settings.system
+
+
+PLANNERS = [
+    (task, name)
+    for task, name in EVERY
+    if "mpc" in name.lower() or "entralized" in name or "filter" in name
+]
+
+
+@pytest.mark.parametrize(("task", "name"), PLANNERS)
+def test_a_memory_of_another_kind_is_refused(task, name):
+    policy = built(task, name)
+    row = seen(task, name)[0]
+    for state in ("text", 3, [1], [object()] * 2, {"a": 1}, np.zeros(2), [None] * 7):
+        with pytest.raises(ValueError, match=r"state|memories"):
+            policy.predict(row, state)
+
+
+@pytest.mark.parametrize(("task", "name"), [pair for pair in PLANNERS if "lagros+" not in pair[1]])
+def test_a_memory_of_the_last_episode_is_refused_or_given_up(task, name):
+    policy = built(task, name)
+    _, state = policy.predict(seen(task, name, 0)[0])
+    for row in seen(task, name, 0)[1:]:
+        _, state = policy.predict(row, state)
+    row = seen(task, name, 1)[0]
+    with pytest.raises(ValueError, match="episode_start"):
+        policy.predict(row, state)
+    count = len(np.atleast_2d(row))
+    action, _ = policy.predict(row, state, np.ones(count, bool))
+    assert np.array_equal(action, policy.predict(row)[0])

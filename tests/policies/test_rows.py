@@ -10,14 +10,14 @@ from lagros_policies.spacecraft_setup import task_and_preset
 
 
 def test_a_new_state_remembers_nothing():
-    assert row_memories(None, None, 3, "rows") == [None] * 3
-    assert row_memories(None, np.array([True, False]), 2, "rows") == [None] * 2
+    assert row_memories(None, None, 3, "rows", str) == [None] * 3
+    assert row_memories(None, np.array([True, False]), 2, "rows", str) == [None] * 2
 
 
 def test_only_the_rows_that_start_forget():
     state = ["a", "b", "c"]
-    assert row_memories(state, None, 3, "rows") == state
-    assert row_memories(state, np.array([False, True, False]), 3, "rows") == ["a", None, "c"]
+    assert row_memories(state, None, 3, "rows", str) == state
+    assert row_memories(state, np.array([False, True, False]), 3, "rows", str) == ["a", None, "c"]
     assert state == ["a", "b", "c"]
 
 
@@ -26,7 +26,7 @@ def test_only_the_rows_that_start_forget():
 )
 def test_memories_starts_and_rows_are_equally_many(state, starts):
     with pytest.raises(ValueError, match="2 are observed"):
-        row_memories(state, starts, 2, "rows")
+        row_memories(state, starts, 2, "rows", str)
 
 
 def test_the_task_is_the_papers_and_the_preset_has_the_agents_asked_for():
