@@ -18,6 +18,8 @@ from typing import Any, Literal, TypeGuard, Union, get_args, get_origin, get_typ
 
 # Control steps of an episode, whose states are kept.
 MOST_STEPS = 1_000_000
+# As much as NumPy recommends as the entropy of a seed.
+MOST_SEEDS = 1 << 128
 # Letters of a value in a message; a longer one is cut.
 _SHOWN = 80
 
@@ -164,9 +166,10 @@ def check_seed(seed: int) -> None:
     """Check a seed.
 
     Raises:
-        ValueError: It is no integer, or negative.
+        ValueError: It is no integer, negative or enormous.
     """
-    _check(is_whole(seed) and seed >= 0, "seed", seed, "a non-negative integer")
+    holds = is_whole(seed) and 0 <= seed < MOST_SEEDS
+    _check(holds, "seed", seed, "a non-negative integer below 2**128")
 
 
 def check_flag(name: str, value: bool) -> None:

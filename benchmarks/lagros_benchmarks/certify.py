@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 POLICIES = {"cartpole": ("lagros", "tube-mpc"), "spacecraft": ("lagros", "centralized")}
 BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
 _EPISODES = {"cartpole": 400, "spacecraft": 20}
+_MOST_EPISODES = 1_000_000
 _WIDTH = 80
 # alpha of the spacecraft's policies, in the plane and of the heading [1/s].
 _PLANE_RATE, _TURNING_RATE = 2.0, 0.3
@@ -62,24 +63,27 @@ def certify(
     Ends with status 1 if anything that it claims does not hold.
     """
     from lagros_benchmarks.settings import check_task
+    from lagros_envs.checks import check_positive, check_whole, shown
+    from lagros_envs.reading import check_file
 
     try:
         check_task(task)
         if policy not in POLICIES[task]:
             raise ValueError(
-                f"--policy: {policy!r} must be one of {', '.join(POLICIES[task])}: the theorems "
-                "speak of u* and of what imitates it"
+                f"--policy: {shown(policy)} must be one of {', '.join(POLICIES[task])}: the "
+                "theorems speak of u* and of what imitates it"
             )
-        if bound is not None and not 0.0 < bound < float("inf"):
-            raise ValueError(f"--bound: {bound!r} must be positive and finite")
-        if episodes is not None and episodes < 0:
-            raise ValueError(f"--episodes: {episodes!r} must be at least 0")
-        if not seconds > 0.0:
-            raise ValueError(f"--seconds: {seconds!r} must be positive")
+        if bound is not None:
+            check_positive("bound", bound)
+        if episodes is not None:
+            check_whole("episodes", episodes, 0, _MOST_EPISODES)
+        check_positive("seconds", seconds)
+        if metric is not None:
+            check_file(metric)
         if largest and task != "cartpole":
             raise ValueError("--largest: the spacecraft's proof is for all states already")
         check_outputs({"--json": json}, {"--metric": metric})
-    except ValueError as error:
+    except (ValueError, FileNotFoundError) as error:
         fail(error)
     level = BOUNDS[task] if bound is None else bound
     try:
@@ -87,8 +91,6 @@ def certify(
             found = certify_cartpole(metric, policy, level, episodes, seconds, largest)
         else:
             found = certify_spacecraft(metric, policy, level, episodes, seconds)
-    except FileNotFoundError as error:
-        fail(f"--metric: there is no file {error.filename}", status=1)
     except (ValueError, OSError, RuntimeError) as error:
         # A metric that cannot be read, or is none, is a certificate that cannot be given.
         fail(error, status=1)

@@ -30,6 +30,7 @@ from lagros_benchmarks.terminal import (
     listed_or_none,
     progress_bar,
     progress_line,
+    refuse_options,
 )
 from lagros_benchmarks.train import train
 from lagros_benchmarks.watch import watch
@@ -165,7 +166,14 @@ def bench(
     Exit status 3: everything is written, and some episodes raised; their rows are marked.
     """
     from lagros_benchmarks.report import Outputs
-    from lagros_benchmarks.settings import BenchmarkSettings, check_policy, check_task
+    from lagros_benchmarks.settings import (
+        DEFAULT_POLICIES,
+        BenchmarkSettings,
+        check_policy,
+        check_task,
+    )
+    from lagros_envs.cartpole_task import CartPoleSettings
+    from lagros_envs.checks import check_whole
     from lagros_policies.backends import Backend
     from lagros_policies.naming import listed_names
 
@@ -174,8 +182,18 @@ def bench(
     find_users_modules(named or ())
     try:
         check_task(task)
-        if replan_every is not None and task != "cartpole":
-            raise ValueError(f"--replan-every is for cartpole; leave it out for {task}")
+        if named is not None and "" in named:
+            raise ValueError("--policies: an entry is empty; write them as a,b")
+        if scene is None:
+            refuse_options(["--scene-world"], "no --scene is asked for")
+        if disturbance.strip() == "none":
+            refuse_options(["--bound"], "no disturbance has a bound")
+        if replan_every is not None:
+            if task != "cartpole":
+                raise ValueError(f"--replan-every is for cartpole; leave it out for {task}")
+            if "tube-mpc" not in (named or DEFAULT_POLICIES):
+                raise ValueError("--replan-every is for tube-mpc, which is none of --policies")
+            check_whole("replan_every", replan_every, 1, CartPoleSettings().steps)
         settings = BenchmarkSettings.for_task(
             task,
             policies=listed_or_none(named, str, "--policies"),
@@ -251,7 +269,7 @@ def reproduce(
         workers = Backend(backend, address)
         wanted = _reproduction(task, episodes, jobs, workers)
         outputs = _reproduced(task, place)
-        outputs.check(task)
+        outputs.check(task, folders={"--out": folder})
         with progress_bar() as progress, running(workers, jobs):
             benchmark = (
                 wanted.benchmark(None)

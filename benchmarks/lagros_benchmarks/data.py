@@ -20,7 +20,7 @@ import typer
 
 from lagros_benchmarks.extras import check_extra
 from lagros_benchmarks.outputs import Delivery, check_outputs
-from lagros_benchmarks.terminal import Command, fail, progress_bar
+from lagros_benchmarks.terminal import Command, fail, progress_bar, refuse_options
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -73,9 +73,11 @@ def export(
     from lagros_policies.imitation.demonstrations import DemonstrationSettings, demonstrate
 
     try:
+        if disturbance == "none":
+            refuse_options(["--bound"], "no disturbance has a bound")
         settings = DemonstrationSettings(task, episodes, seed, disturbance, bound)
     except ValueError as error:
-        fail(f"--{error}")
+        fail(error)
     try:
         check_free(out, dataset_id(task))
     except ValueError as error:

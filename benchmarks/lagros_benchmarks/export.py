@@ -65,14 +65,15 @@ def export(
     ] = None,
 ) -> None:
     """Write a policy's network as one C file or ONNX model: observation in, newtons out."""
+    from lagros_envs.checks import shown
     from lagros_envs.files import write_atomic
     from lagros_policies.export.c99 import TANHS
     from lagros_policies.export.source import CARTPOLE_NAMES, SPACECRAFT_NAMES, load_source
 
     if format_ not in FORMATS:
-        fail(f"--format: {format_!r} must be one of {', '.join(FORMATS)}")
+        fail(f"--format: {shown(format_)} must be one of {', '.join(FORMATS)}")
     if tanh is not None and tanh not in TANHS:
-        fail(f"--tanh: {tanh!r} must be one of {', '.join(TANHS)}")
+        fail(f"--tanh: {shown(tanh)} must be one of {', '.join(TANHS)}")
     if format_ == "onnx" and tanh is not None:
         fail("--tanh is for --format c; leave it out for onnx")
     if policy in CARTPOLE_NAMES and (preset is not None or agents is not None):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,9 +43,11 @@ def check_outputs(
 
     seen: dict[object, str] = {}
     for option, path in (inputs or {}).items():
-        if path is not None and path.is_file():
-            status = path.stat()
-            seen[status.st_dev, status.st_ino] = f"what {option} reads"
+        # What cannot be looked at is no file, and is refused by whoever reads it.
+        with suppress(OSError, ValueError):
+            if path is not None and path.is_file():
+                status = path.stat()
+                seen[status.st_dev, status.st_ino] = f"what {option} reads"
     made: tuple[Path, ...] = ()
     try:
         for option, path in outputs.items():

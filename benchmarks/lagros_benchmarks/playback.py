@@ -11,7 +11,7 @@ from typing import Any
 
 import lagros_envs  # noqa: F401  (registers the environments)
 from lagros_benchmarks.flying import Attempt
-from lagros_benchmarks.settings import unknown_name
+from lagros_benchmarks.settings import check_policy, unknown_name
 from lagros_benchmarks.video import FRAME_RATES, Frame, check_video_path, video_bytes
 from lagros_benchmarks.watched import CartPoleGame, SpacecraftGame
 from lagros_envs.canvas import import_pygame
@@ -75,6 +75,7 @@ class WatchSettings:
         check_fields(self)
         if self.task not in TASKS:
             raise ValueError(unknown_name("task", self.task, TASKS))
+        check_policy(self.policy, self.task)
         if self.disturbance not in WATCHED_KINDS:
             raise ValueError(unknown_name("disturbance", self.disturbance, WATCHED_KINDS))
         if self.preset is not None and self.preset not in PRESETS:

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import typer
@@ -32,13 +33,15 @@ _CONTEXT: ContextVar[Any] = ContextVar("context", default=None)
 # How the settings begin a message on one of their fields.
 _FIELD = re.compile(r"(\w+)=|unknown ([\w ]+?) ['\"]|(\w+) must not be empty")
 _SHOWN = 60  # letters of an entry in a message
+_LONGEST = 800  # letters of a message
 
 
 def fail(error: Exception | str, status: int = USAGE_ERROR) -> NoReturn:
     """Say what is wrong, without a traceback, and end with the exit status."""
-    text = _named_by_option(str(error))
+    text = str(error)
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         text = f"{error.filename}: {error.strerror}"
+    text = _shortened(_named_by_option(text))
     if isinstance(error, Exception) and "pip install" not in text:
         text += install_hint(error)
     typer.echo(f"lagros: {text}", err=True)
@@ -47,6 +50,21 @@ def fail(error: Exception | str, status: int = USAGE_ERROR) -> NoReturn:
 
 class Command(TyperCommand):
     """A command that is known, while it runs, to what is said of its options."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Refuse what no option can mean: nothing at all, and what no system takes in a name."""
+        for before, argument in zip(["", *args], args, strict=False):
+            option, equals, value = argument.partition("=")
+            if not (equals and option.startswith("--")):
+                option, value = before, argument
+            if not value or "\0" in value:
+                what = "a null byte" if value else "empty"
+                raise typer.BadParameter(
+                    f"it is {what}; give a value, or leave the option out",
+                    ctx=ctx,
+                    param_hint=repr(option if option.startswith("--") else self.name),
+                )
+        return super().parse_args(ctx, args)
 
     def invoke(self, context: Any) -> Any:
         """Run it."""
@@ -100,14 +118,30 @@ def _options(context: Any) -> dict[str, str]:
 def _named_by_option(text: str) -> str:
     """Put the option before a message of the settings, which know the field but not the option."""
     context = _CONTEXT.get()
-    said = _FIELD.match(text)
-    if context is None or said is None:
+    if context is None:
         return text
-    field = next(filter(None, said.groups()))
-    for option, name in _options(context).items():
-        if _stem(name) == _stem(field) and option not in text:
+    options = _options(context)
+    if any(re.search(rf"{option}\b", text) for option in options):
+        return text
+    said = _FIELD.match(text)
+    field = next(filter(None, said.groups())) if said else ""
+    for option, name in options.items():
+        value = context.params.get(name)
+        if _stem(name) == _stem(field) or (isinstance(value, Path) and _speaks_of(text, value)):
             return f"{option}: {text}"
     return text
+
+
+def _speaks_of(text: str, path: Path) -> bool:
+    """Return whether a message names a path, alone or as the folder of another."""
+    names = {re.escape(name) for name in (str(path), repr(str(path))[1:-1])}
+    return re.search(rf"(^|[\s'\"(])({'|'.join(names)})([\s'\":,;)/]|$)", text) is not None
+
+
+def _shortened(text: str) -> str:
+    """Return a message on one line and of a length that can be read."""
+    line = " ".join(text.split())
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} … {line[-_LONGEST // 2 :]}"
 
 
 def _stem(name: str) -> str:

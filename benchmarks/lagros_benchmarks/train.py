@@ -71,6 +71,7 @@ def train(
     ] = None,
 ) -> None:
     """Train agents, one after the other; go on where a run was killed, skip what is complete."""
+    from lagros_benchmarks.settings import check_task
     from lagros_benchmarks.training.settings import default_training
 
     try:
@@ -85,6 +86,7 @@ def train(
             raise ValueError(f"--parallel-env is for spacecraft; leave it out for {task}")
         if residual is not None and task != "cartpole":
             raise ValueError(f"--residual is for cartpole; leave it out for {task}")
+        check_task(task)
         changes: dict[str, Any] = {} if segments is None else {"segments": segments}
         if residual is not None:
             changes["largest_correction"] = residual
@@ -104,7 +106,7 @@ def train(
             {f"--out, seed {run.seed}": folder_of(run, out) for run in runs},
         )
     except ValueError as error:
-        fail(error)
+        fail(str(error).replace("largest_correction", "--residual"))
     _say_what_happens()
     try:
         records = [

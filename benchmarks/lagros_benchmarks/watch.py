@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from lagros_benchmarks.outputs import Delivery, check_outputs, policy_files
-from lagros_benchmarks.terminal import fail, find_users_modules
+from lagros_benchmarks.terminal import fail, find_users_modules, refuse_options
 
 
 def watch(
@@ -81,6 +81,8 @@ def watch(
 
     find_users_modules([policy])
     try:
+        if disturbance == "none":
+            refuse_options(["--bound"], "no disturbance has a bound")
         settings = WatchSettings(
             task=task,
             policy=policy,

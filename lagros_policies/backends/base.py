@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from lagros_envs.checks import check_fields
+from lagros_envs.checks import check_fields, shown, suggestion
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
@@ -51,11 +51,14 @@ class Backend:
         """Check the values."""
         check_fields(self)
         if self.name not in BACKENDS:
-            raise ValueError(f"unknown backend {self.name!r}. Valid: {', '.join(BACKENDS)}.")
+            hint = suggestion(self.name, BACKENDS)
+            raise ValueError(
+                f"unknown backend {shown(self.name)}.{hint} Valid: {', '.join(BACKENDS)}."
+            )
         if self.name == "loky" and self.address is not None:
             raise ValueError(
-                f"address={self.address!r} is for a cluster of ray or dask; leave it out for loky, "
-                "whose workers run on this machine"
+                f"address={shown(self.address)} is for a cluster of ray or dask; leave it out for "
+                "loky, whose workers run on this machine"
             )
 
     def in_parallel(self, jobs: int) -> bool:
