@@ -78,15 +78,15 @@ def certify(
         if episodes is not None:
             check_whole("episodes", episodes, 0, _MOST_EPISODES)
         check_positive("seconds", seconds)
-        if metric is not None:
-            check_file(metric)
         if largest and task != "cartpole":
             raise ValueError("--largest: the spacecraft's proof is for all states already")
         check_outputs({"--json": json}, {"--metric": metric})
-    except (ValueError, FileNotFoundError) as error:
+    except ValueError as error:
         fail(error)
     level = BOUNDS[task] if bound is None else bound
     try:
+        if metric is not None:
+            check_file(metric)
         if task == "cartpole":
             found = certify_cartpole(metric, policy, level, episodes, seconds, largest)
         else:

@@ -239,11 +239,11 @@ def test_what_killed_exports_left_is_removed(tmp_path):
     ("arguments", "message"),
     [
         ((), "name the format to write: pass --minari"),
-        (("--minari", "--task", "cartpol"), "--task='cartpol' must be one of cartpole, spacecraft"),
-        (("--minari", "--episodes", "0"), "--episodes=0 must be a whole number"),
-        (("--minari", "--seed", "-1"), "--seed=-1 must be a non-negative integer"),
-        (("--minari", "--disturbance", "worst"), "--disturbance='worst' must be one of none,"),
-        (("--minari", "--bound", "-1"), "--bound=-1.0 must be finite and >= 0"),
+        (("--minari", "--task", "cartpol"), "task='cartpol' must be one of cartpole, spacecraft"),
+        (("--minari", "--episodes", "0"), "episodes=0 must be a whole number"),
+        (("--minari", "--seed", "-1"), "seed=-1 must be a non-negative integer"),
+        (("--minari", "--disturbance", "worst"), "disturbance='worst' must be one of none,"),
+        (("--minari", "--bound", "-1"), "bound=-1.0 must be finite and >= 0"),
         (("--minari", "--out", "/proc/none/x"), "--out: cannot write '/proc/none/x"),
     ],
 )

@@ -160,12 +160,15 @@ def test_a_file_that_disagrees_is_not_written(invoke, tmp_path, monkeypatch, dif
         (("lagros-cartpole", "--format", "h"), "--format: 'h' must be one of c, onnx"),
         (("lagros-cartpole", "--tanh", "fast"), "--tanh: 'fast' must be one of rational, libm"),
         (("lagros-cartpole", "--format", "onnx", "--tanh", "rational"), "leave it out for onnx"),
-        (("lagros-cartpole", "--weights", "none.safetensors"), "no weight file"),
+        (("lagros-cartpole", "--weights", "none.safetensors"), "there is no file none.safetensors"),
         (("lagros-cartpole", "--agents", "3"), "leave them out for the cart-pole"),
         (("lagros-spacecraft", "--tanh", "libm"), "the spacecraft's network has no tanh"),
         (("lagros-spacecraft", "--preset", "moon"), "preset='moon' is not known"),
         (("lagros-spacecraft", "--agents", "0"), "num_agents=0 must be a whole number"),
-        (("lagros-spacecraft", "--weights", "none.safetensors"), "no weight file"),
+        (
+            ("lagros-spacecraft", "--weights", "none.safetensors"),
+            "there is no file none.safetensors",
+        ),
     ],
 )
 def test_a_mistake_is_explained_with_status_2_and_no_traceback(invoke, arguments, message):

@@ -457,7 +457,7 @@ def test_the_actor_is_the_model(tmp_path):
 
 
 def test_other_weights_are_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no weight file"):
+    with pytest.raises(FileNotFoundError, match="there is no file"):
         SpacecraftPpoPolicy(weights=tmp_path / "none.safetensors")
     with pytest.raises(ValueError, match="this agent maps 53 to 3"):
         SpacecraftPpoPolicy(weights=Mlp([np.zeros((4, 1))], [np.zeros(1)]))

@@ -235,7 +235,7 @@ def test_the_provenance_is_that_of_the_file():
 def test_mistakes_are_explained(tmp_path):
     with pytest.raises(ValueError, match="choose one of lagros-cartpole, learned-cartpole, "):
         load_source("lqr")
-    with pytest.raises(FileNotFoundError, match="no weight file"):
+    with pytest.raises(FileNotFoundError, match="there is no file"):
         load_source("lagros-cartpole", tmp_path / "none.safetensors")
     Mlp([np.ones((5, 1))], [np.ones(1)]).save(tmp_path / "five.safetensors")
     with pytest.raises(ValueError, match="a cart-pole network has 7 and 1"):

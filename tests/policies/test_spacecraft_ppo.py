@@ -84,7 +84,7 @@ def test_errors_say_what_to_do(tmp_path):
     rows = np.full((2, policy.layout.size), np.nan, np.float32)
     with pytest.raises(ValueError, match="not finite"):
         policy.predict(rows)
-    with pytest.raises(FileNotFoundError, match="there is no weight file"):
+    with pytest.raises(FileNotFoundError, match="there is no file"):
         SpacecraftPpoPolicy(weights=tmp_path / "none.safetensors")
     path = tmp_path / "cut.safetensors"
     path.write_bytes(WEIGHTS.read_bytes()[:-100])
