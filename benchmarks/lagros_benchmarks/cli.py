@@ -163,7 +163,8 @@ def bench(
 ) -> None:
     """Compare policies on the same episodes; print the table, write what is asked for.
 
-    Exit status 3: everything is written, and some episodes raised; their rows are marked.
+    A policy is waited for, however long it takes. Exit status 3: everything is written, and in some
+    episodes a policy raised; they count as failures, and their rows are marked.
     """
     from lagros_benchmarks.report import Outputs
     from lagros_benchmarks.settings import (

@@ -250,5 +250,6 @@ def _preset(settings: WatchSettings, scenario: Scenario | None) -> Preset:
 
 def _efforts(what: str, to_success: float, to_end: float) -> str:
     """Return the effort as tables have it, and to the end of the episode where that is more."""
-    text = f"{what} to success {to_success:.2f} N²s"
-    return text if to_end == to_success else f"{text} (to the end {to_end:.2f} N²s)"
+    if to_end == to_success:
+        return f"{what} {to_end:.2f} N²s"
+    return f"{what} to success {to_success:.2f} N²s, to the end {to_end:.2f} N²s"

@@ -20,6 +20,7 @@ from lagros_benchmarks.playback import Playback, WatchSettings
 from lagros_envs import spacecraft_v0
 from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.scenarios import Scenario
+from lagros_policies.baselines import LqrPolicy
 
 pygame = pytest.importorskip("pygame")
 
@@ -318,7 +319,7 @@ def test_the_safety_filter_is_put_on(invoke, tmp_path, monkeypatch):
         *("--safety-filter", "--video", "x.gif"),
     )
     assert result.exit_code == 0, result.output
-    assert "mean effort of an agent to success 0.00 N²s" in result.output
+    assert "mean effort of an agent 0.00 N²s" in result.output
     assert seen["bound"] == 0.7
     assert seen["preset"].agents == 2
 
@@ -408,3 +409,22 @@ def test_the_missing_extra_is_named_before_anything_is_played(
     result = invoke("spacecraft", "--policy", "pilots:Broken", "--video", f"x.{suffix}")
     assert result.exit_code == 1
     assert f'pip install "{extra}"' in result.output
+
+
+def test_an_effort_says_what_it_is(invoke, monkeypatch):
+    """To success, as the tables have it; to the end beside it where the episode went on."""
+    options = ("--disturbance", "none", "--seconds", 4, "--speed", 20, "--video", "x.gif")
+    result = invoke("cartpole", "--policy", "lqr", *options)
+    env = gymnasium.make("lagros/CartPole-v0").unwrapped
+    policy = LqrPolicy()
+    observation, _ = env.reset(seed=0)
+    efforts, arrived = [], None
+    for _ in range(40):
+        action, _ = policy.predict(observation)
+        observation, _, _, _, info = env.step(action)
+        efforts.append((40.0 * float(action[0])) ** 2 * 0.1)
+        if info["success"] and arrived is None:
+            arrived = len(efforts)
+    to_success, to_end = sum(efforts[:arrived]), sum(efforts)
+    said = f"effort to success {to_success:.2f} N²s, to the end {to_end:.2f} N²s"
+    assert said in result.output
