@@ -23,6 +23,7 @@ from lagros_envs.conventions import (
 )
 from lagros_envs.disturbances import Disturbance
 from lagros_envs.options import known_options
+from lagros_envs.seeding import SharedStreams
 
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
@@ -75,8 +76,10 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
     A world has one row or more in what is observed and done. A subclass moves the worlds and says
     how one starts; `reset` and the autoreset modes are here.
 
-    `reset(seed=...)` takes one integer, from which the worlds draw independent seeds, or a list
-    with one seed per world, each of which starts the episode that the single environment starts.
+    `reset(seed=...)` takes a list with one seed per world, each of which starts the episode that
+    the single environment starts, or one integer for the list that begins with it: seed, seed + 1,
+    ..., as in Gymnasium's `SyncVectorEnv`. Episodes that begin without a seed, those of autoreset
+    among them, draw from what all worlds share: the same seed gives the same again.
     `reset(options=...)` takes `reset_mask` (worlds,), the worlds to start; what the options say of
     the others is not looked at. A reset that is refused leaves every world as it was.
 
@@ -140,6 +143,7 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
         self._started = False
         # Of the episodes of all worlds, where nothing starts them anew.
         self._end = End.NOT_YET
+        self._streams: SharedStreams | None = None
 
     @property
     def step_limit(self) -> int:
@@ -147,8 +151,11 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
         return self._step_limit
 
     @abstractmethod
-    def _start(self, worlds: IntArray, seeds: Sequence[int], given: dict[str, Any]) -> None:
-        """Begin an episode in these worlds, one seed for each, with what `_checked` returned."""
+    def _start(self, worlds: IntArray, seeds: Sequence[int] | None, given: dict[str, Any]) -> None:
+        """Begin an episode in these worlds with what `_checked` returned.
+
+        Each has a seed of its own, or all draw from `_shared` or `np_random`.
+        """
 
     @abstractmethod
     def _checked(self, mask: BoolArray, options: dict[str, Any]) -> dict[str, Any]:
@@ -173,13 +180,13 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
     def reset(
         self,
         *,
-        seed: int | Sequence[int] | None = None,
+        seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Float32Array, dict[str, Any]]:
         """Start an episode in every world, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: One integer, or one per world.
+            seed: One integer, or one per world; a world whose own is None starts without.
             options: See the class.
 
         Returns:
@@ -199,11 +206,11 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
         if not self._started and not mask.all():
             raise ValueError("the first reset must start every world; leave out reset_mask")
         given = self._checked(mask, options)
-        if seeds is not None:
+        if isinstance(seed, int | np.integer):
+            super().reset(seed=int(seed))
+        elif known := [value for value in seeds or () if value is not None]:
             # The episodes that autoreset starts are as reproducible as the first ones.
-            self.np_random = np.random.default_rng(seeds)
-        elif seed is not None:
-            super().reset(seed=plain_seed(cast(int, seed)))
+            self.np_random = np.random.default_rng(known)
         self._begin(mask, seeds, given)
         self._set_nominal(mask, given)
         self._started, self._end = True, End.NOT_YET
@@ -215,13 +222,34 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
         if self._end is not End.NOT_YET:
             self._end = warned_after(self._end)
 
-    def _restart_pending(self) -> BoolArray | None:
-        """Start what the last step has left to be started; return which worlds that are, if any."""
-        restarting = self._pending
-        if not np.count_nonzero(restarting):
+    @property
+    def _shared(self) -> SharedStreams:
+        """What episodes without a seed draw from; renewed with `np_random`."""
+        if self._streams is None or self._streams.source is not self.np_random:
+            self._streams = SharedStreams(self.np_random)
+        return self._streams
+
+    def _restarting(self) -> BoolArray | None:
+        """Return which worlds are to start anew on this step, None for none.
+
+        They are moved with the others, since that is quicker than to leave them out, and started
+        by `_restart` thereafter.
+        """
+        if not np.count_nonzero(self._pending):
             return None
-        self._begin_unasked(restarting)
-        return restarting
+        self._refuse_worst()
+        return self._pending
+
+    def _restart(self, worlds: BoolArray, *zeroed: NDArray[Any]) -> None:
+        """Start what `_restarting` gave; this step has brought these worlds nothing.
+
+        Args:
+            worlds: Which worlds.
+            zeroed: Rewards and ends of the step, the worlds first; false there from now on.
+        """
+        for array in zeroed:
+            array[worlds] = 0
+        self._begin_unasked(worlds)
 
     def _after_step(self, ended: BoolArray) -> tuple[Float32Array, dict[str, Any]]:
         """Return observation and info of a step, after the restarts that the mode asks for.
@@ -249,36 +277,45 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
         if self._end is End.NOT_YET and np.count_nonzero(ended) == ended.size:
             self._end = End.REACHED
 
-    def _seeds(self, seed: int | Sequence[int] | None) -> list[int] | None:
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None] | None:
         if seed is None or isinstance(seed, int | np.integer):
-            plain_seed(seed)
-            return None
-        seeds = [int(value) for value in seed]
-        if len(seeds) != self.num_worlds or min(seeds) < 0:
+            first = plain_seed(seed)
+            # Gymnasium's convention. The runs of this project give lists, from
+            # `seeding.episode_seeds`: neighbouring seeds would share episodes.
+            return None if first is None else list(range(first, first + self.num_worlds))
+        seeds = [None if value is None else int(value) for value in seed]
+        if len(seeds) != self.num_worlds or any(value is not None and value < 0 for value in seeds):
             raise ValueError(
                 f"seed must be {self.num_worlds} non-negative integers, one per world; it is "
                 f"{seed!r}"
             )
         return seeds
 
-    def _begin_unasked(self, mask: BoolArray) -> None:
-        """Start the episodes of an autoreset, for which nobody has planned a nominal."""
+    def _refuse_worst(self) -> None:
         if self.disturbance.kind == "worst":
             raise ValueError(
                 'disturbance="worst" needs nominal trajectories for every episode, and an '
                 'autoreset starts one without: use autoreset_mode="disabled" and reset with '
                 'options={"nominal": ..., "reset_mask": ...}'
             )
+
+    def _begin_unasked(self, mask: BoolArray) -> None:
+        """Start the episodes of an autoreset, for which nobody has planned a nominal."""
+        self._refuse_worst()
         self._forget_nominal(mask)
         self._begin(mask, None, {})
 
-    def _begin(self, mask: BoolArray, seeds: list[int] | None, given: dict[str, Any]) -> None:
-        """Start the masked worlds, from the seeds of all or from new ones."""
+    def _begin(
+        self, mask: BoolArray, seeds: list[int | None] | None, given: dict[str, Any]
+    ) -> None:
+        """Start the masked worlds, from the seeds of all or from the shared generators."""
         worlds = np.flatnonzero(mask)
-        chosen = (
-            self.np_random.integers(2**63, size=worlds.size).tolist()
-            if seeds is None
-            else [seeds[world] for world in worlds]
-        )
-        self._start(worlds, chosen, given)
+        if seeds is None:
+            self._start(worlds, None, given)
+        else:
+            seeded = np.array([seeds[world] is not None for world in worlds], bool)
+            chosen = [cast(int, seeds[world]) for world in worlds[seeded]]
+            for some, theirs in ((worlds[seeded], chosen), (worlds[~seeded], None)):
+                if some.size:
+                    self._start(some, theirs, given)
         self._pending = self._pending & ~mask

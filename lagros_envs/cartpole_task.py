@@ -120,9 +120,9 @@ def sample_scenario(rng: np.random.Generator, settings: CartPoleSettings) -> Car
     return scenario_of_shares(draw_shares(rng), settings)
 
 
-def draw_shares(rng: np.random.Generator) -> FloatArray:
-    """Draw theta_0 and p_f, each as a share of its range in [-1, 1], shape (2,)."""
-    return rng.uniform(-1.0, 1.0, size=2)
+def draw_shares(rng: np.random.Generator, shape: tuple[int, ...] = ()) -> FloatArray:
+    """Draw theta_0 and p_f, each as a share of its range in [-1, 1], shape (*shape, 2)."""
+    return rng.uniform(-1.0, 1.0, size=(*shape, 2))
 
 
 def scenario_of_shares(shares: FloatArray, settings: CartPoleSettings) -> CartPoleScenario:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -19,10 +19,21 @@ from lagros_envs.disturbances import Disturbance, Situation, channel_mask
 from lagros_envs.dynamics.held import HeldBatch
 from lagros_envs.options import checked_actions
 from lagros_envs.seeding import seeded_streams
+from lagros_envs.stepwise import StepwiseDisturbance
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
+
+# Rows of what is kept of every world, so that a restart writes all of it at once. Coordinates come
+# first: that is what the equation of motion works on.
+_STATE, _GOAL = slice(0, 4), slice(4, 8)
+_EFFORT, _EFFORT_TO_SUCCESS, _SUCCESS_TIME, _DISTANCE, _NOW, _RADIUS = range(8, 14)
+_ROWS = 14
+# Rows of its flags: no success so far, inside the tube now, fallen.
+_OPEN, _INSIDE, _FALLEN = range(3)
+# Start and goal in an observation, which stay the same for an episode.
+_BLANK = slice(task.GOAL.start, task.INITIAL_STATE.stop)
 
 
 class CartPoleVectorEnv(RestartingVectorEnv):
@@ -104,24 +115,19 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         self._allocate()
 
     def _allocate(self) -> None:
-        # Coordinates come first, (4, worlds): that is what the equation of motion works on.
         worlds, self._steps = self.num_envs, self.settings.steps
-        self._state = np.zeros((task.STATE_DIM, worlds))
-        self._goal = np.zeros((task.STATE_DIM, worlds))
-        self._pushes = np.zeros((worlds, self._steps, task.STATE_DIM))
-        self._push = np.zeros((worlds, task.STATE_DIM))
-        self._step = np.zeros(worlds, dtype=np.intp)
-        self._distance = np.zeros(worlds)
-        self._effort = np.zeros(worlds)
-        self._effort_to_success = np.zeros(worlds)
-        self._success_time = np.full(worlds, np.inf)
-        # Worlds without a success so far.
-        self._open = np.ones(worlds, dtype=bool)
-        self._fallen = np.zeros(worlds, dtype=bool)
+        self._kept = np.zeros((_ROWS, worlds))
+        self._flags = np.zeros((3, worlds), bool)
+        self._step = np.zeros(worlds, np.intp)
+        self._push = np.zeros((task.STATE_DIM, worlds))
+        # Drawn in advance, for the episodes that were begun with a seed.
+        self._pushes: FloatArray | None = None
+        self._in_advance = np.zeros(worlds, bool)
+        self._stepwise = StepwiseDisturbance(self.disturbance, worlds, self.settings.control_period)
         self._worlds = np.arange(worlds)
-        self._first_push = self._worlds * self._steps
-        # t and r(t) at every control instant.
-        instants = np.arange(self._steps + 1)
+        # t and r(t) at every control instant, and at the one to which a world that is to start
+        # anew is moved.
+        instants = np.arange(self._steps + 2)
         self._times: FloatArray = np.multiply(instants, self.settings.control_period)
         self._radii: FloatArray = self.settings.tube.radius(self._times)
         # What stays the same in every observation of an episode: goal and initial state.
@@ -146,31 +152,31 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         """
         self._need_start()
         force = self._force(actions)
-        restarting = self._restart_pending()
+        restarting = self._restarting()
         if restarting is not None:
             force[restarting] = 0.0
-        effort, rewards = self._advance(force, restarting)
-        first_success = self._note_arrivals()
-        eventful = first_success | self._fallen
-        if np.count_nonzero(eventful):
-            rewards[eventful] = task.reward(
-                self.settings,
-                effort[eventful],
-                self._distance[eventful],
-                first_success[eventful],
-                self._fallen[eventful],
-            )
-        if restarting is not None:
-            rewards[restarting] = 0.0
-        terminated = self._fallen.copy()
+        effort, rewards = self._advance(force)
+        first_success, fallen = self._note_arrivals(), self._flags[_FALLEN]
+        eventful = np.flatnonzero(first_success | fallen)
+        if eventful.size:
+            parts = effort, self._kept[_DISTANCE], first_success, fallen
+            chosen = (part.take(eventful) for part in parts)
+            rewards[eventful] = task.reward(self.settings, *chosen)
+        terminated = fallen.copy()
         truncated = self._step >= self.step_limit
+        if restarting is not None:
+            self._restart(restarting, rewards, terminated, truncated)
         observation, info = self._after_step(terminated | truncated)
         return observation, rewards, terminated, truncated, info
 
     @property
     def state(self) -> FloatArray:
         """The states x in double precision, shape (num_envs, 4)."""
-        return np.ascontiguousarray(self._state.T)
+        return np.ascontiguousarray(self._kept[_STATE].T)
+
+    @property
+    def _goal(self) -> FloatArray:
+        return self._kept[_GOAL]
 
     def _checked(self, mask: BoolArray, options: dict[str, Any]) -> dict[str, Any]:
         nominal = task.nominal_from_options(options, self.settings, (self.num_envs,), mask)
@@ -189,77 +195,91 @@ class CartPoleVectorEnv(RestartingVectorEnv):
     def _forget_nominal(self, mask: BoolArray) -> None:
         self.nominal = nominal_after(self.nominal, mask, None)
 
-    def _start(self, worlds: IntArray, seeds: Sequence[int], given: dict[str, Any]) -> None:
-        settings = self.settings
+    def _start(self, worlds: IntArray, seeds: Sequence[int] | None, given: dict[str, Any]) -> None:
+        shares = self._draw(worlds, seeds)
+        stated = {name: value[worlds] for name, value in given.get("scenario", {}).items()}
+        scenario = replace(task.scenario_of_shares(shares, self.settings), **stated)
+        begun = np.zeros((_ROWS, worlds.size))
+        begun[_STATE], begun[_GOAL] = scenario.initial_state.T, scenario.goal.T
+        begun[_DISTANCE] = task.goal_distance(begun[_STATE], begun[_GOAL], np.sqrt)
+        begun[_RADIUS] = self._radii[0]
+        there = begun[_DISTANCE] <= self._radii[0]
+        begun[_SUCCESS_TIME] = np.where(there, 0.0, np.inf)
+        flags = np.zeros((3, worlds.size), bool)
+        flags[_OPEN], flags[_INSIDE] = ~there, there
+        self._kept[:, worlds], self._flags[:, worlds] = begun, flags
+        self._step[worlds] = 0
+        if self.disturbance.kind != "none":
+            self._push[:, worlds] = 0.0
+        self._blank[worlds, _BLANK] = np.concatenate([begun[_GOAL], begun[_STATE]]).T
+
+    def _draw(self, worlds: IntArray, seeds: Sequence[int] | None) -> FloatArray:
+        """Draw scenario and disturbance of the episodes, and return the shares of the scenarios."""
+        disturbed = self.disturbance.kind != "none"
+        if seeds is None:
+            shared = self._shared
+            if disturbed:
+                self._in_advance[worlds] = False
+                self._stepwise.begin(worlds, shared.disturbance)
+            return task.draw_shares(shared.scenario, worlds.shape)
+        if disturbed:
+            if self._pushes is None:
+                self._pushes = np.zeros((self.num_envs, self._steps, task.STATE_DIM))
+            pushes = np.empty((worlds.size, *self._pushes.shape[1:]))
+            streams = seeded_streams(seeds, "disturbance")
+            self.disturbance.realise_all(streams, pushes, self.settings.control_period)
+            self._pushes[worlds] = pushes
+            self._in_advance[worlds] = True
         shares = np.empty((worlds.size, 2))
         for row, rng in zip(shares, seeded_streams(seeds, "scenario"), strict=True):
             row[:] = task.draw_shares(rng)
-        stated = {name: value[worlds] for name, value in given.get("scenario", {}).items()}
-        scenario = replace(task.scenario_of_shares(shares, settings), **stated)
-        pushes = np.empty((worlds.size, self._steps, task.STATE_DIM))
-        streams = seeded_streams(seeds, "disturbance")
-        self.disturbance.realise_all(streams, pushes, settings.control_period)
-        self._pushes[worlds] = pushes
-        self._state[:, worlds] = scenario.initial_state.T
-        self._goal[:, worlds] = scenario.goal.T
-        self._blank[worlds, task.GOAL] = scenario.goal
-        self._blank[worlds, task.INITIAL_STATE] = scenario.initial_state
-        self._push[worlds] = 0.0
-        self._step[worlds] = 0
-        self._effort[worlds] = 0.0
-        self._effort_to_success[worlds] = 0.0
-        self._success_time[worlds] = np.inf
-        self._open[worlds] = True
-        self._fallen[worlds] = False
-        self._measure_distance(worlds)
-        self._note_arrivals()
+        return shares
 
-    def _measure_distance(self, worlds: IntArray | BoolArray) -> None:
-        pair = self._state[:, worlds], self._goal[:, worlds]
-        self._distance[worlds] = task.goal_distance(*pair, np.sqrt)
-
-    def _advance(
-        self, force: FloatArray, restarting: BoolArray | None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Move the worlds that do not restart over one control step.
+    def _advance(self, force: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Move all worlds over one control step.
 
         Returns:
             ||u||^2 dt of the step, and its reward where nothing happened.
         """
-        push = self._current_push()
-        following = self._hold(self._state, [force], push.T, self._goal)
-        self._distance, effort, rewards = self._hold.measured.copy()
-        self._effort += effort
+        kept = self._kept
+        self._push = self._current_push()
+        following = self._hold(kept[_STATE], [force], self._push, kept[_GOAL])
+        distance, effort, rewards = self._hold.measured.copy()
         self._step += 1
+        kept[_EFFORT] += effort
         # A comparison with nan gives False: what could not be integrated stays and has fallen.
-        within = self._distance <= task.LARGEST_DISTANCE
-        if restarting is not None or np.count_nonzero(within) < within.size:
-            lost = ~within
-            if restarting is not None:
-                lost &= ~restarting
-                push[restarting] = 0.0
-                self._step[restarting] = 0
-            kept = lost if restarting is None else lost | restarting
-            following[:, kept] = self._state[:, kept]
-            self._measure_distance(kept)
-            self._fallen = lost | (np.abs(following[1]) > task.FALL_ANGLE)
-        else:
-            self._fallen = np.abs(following[1]) > task.FALL_ANGLE
-        self._state[:] = following
-        self._push = push
+        lost = np.flatnonzero(~(distance <= task.LARGEST_DISTANCE))
+        if lost.size:
+            following[:, lost] = kept[_STATE, lost]
+            distance[lost] = kept[_DISTANCE, lost]
+        kept[_STATE], kept[_DISTANCE] = following, distance
+        fallen = np.greater(np.abs(following[1]), task.FALL_ANGLE, out=self._flags[_FALLEN])
+        fallen[lost] = True
         return effort, rewards
 
     def _current_push(self) -> FloatArray:
-        """Return d of this step, a new array (worlds, 4)."""
-        # Past the time limit (a caller who ignored `truncated`) the last push stays.
-        place = np.minimum(self._step, self._steps - 1)
-        place += self._first_push
-        push = self._pushes.reshape(-1, task.STATE_DIM).take(place, axis=0)
+        """Return d of this step, (4, worlds), not to be written to."""
+        if self.disturbance.kind == "none":
+            return self._push
+        push = self._drawn_push()
         if not self.disturbance.is_feedback:
             return push
-        situation = Situation(self.state, self._nominal_now(), self._clock()[0], push)
+        now = self._kept[_NOW].copy()
+        situation = Situation(self.state, self._nominal_now(), now, np.ascontiguousarray(push.T))
         # A copy: a callable may return an array that it keeps.
-        return self.disturbance.respond(situation).copy()
+        return np.array(self.disturbance.respond(situation).T, order="C")
+
+    def _drawn_push(self) -> FloatArray:
+        """Return what is drawn for this step; of a feedback kind it is a direction."""
+        advance, stepwise = self._in_advance, not self._in_advance.all()
+        drawn = self._stepwise.step(self._step, self._shared.disturbance) if stepwise else None
+        if self._pushes is None or not np.count_nonzero(advance):
+            return cast(FloatArray, drawn)
+        # Past the time limit (a caller who ignored `truncated`) the last push stays.
+        place = np.minimum(self._step, self._steps - 1)
+        place += self._worlds * self._steps
+        stored = self._pushes.reshape(-1, task.STATE_DIM).take(place, axis=0).T
+        return stored if drawn is None else np.where(advance, stored, drawn)
 
     def _force(self, actions: NDArray[np.float32]) -> FloatArray:
         values = checked_actions(actions, (self.num_envs, 1), "the force of each world")[:, 0]
@@ -269,12 +289,12 @@ class CartPoleVectorEnv(RestartingVectorEnv):
 
     def _clock(self) -> tuple[FloatArray, FloatArray]:
         """Return t [s] and r(t) of every world."""
-        if not np.count_nonzero(self._step > self._steps):
-            return self._times.take(self._step), self._radii.take(self._step)
-        # A caller who ignored `truncated`.
-        times: FloatArray = np.multiply(self._step, self.settings.control_period)
-        radii: FloatArray = self.settings.tube.radius(times)
-        return times, radii
+        if np.count_nonzero(self._step >= self._times.size):
+            # A caller who ignored `truncated`.
+            times: FloatArray = np.multiply(self._step, self.settings.control_period)
+            radii: FloatArray = self.settings.tube.radius(times)
+            return times, radii
+        return self._times.take(self._step), self._radii.take(self._step)
 
     def _nominal_now(self) -> FloatArray | None:
         if self.nominal is None:
@@ -283,37 +303,39 @@ class CartPoleVectorEnv(RestartingVectorEnv):
 
     def _note_arrivals(self) -> BoolArray:
         """Note who is inside the tube, and return which worlds have their first success."""
-        self._now, self._radius = self._clock()
-        self._inside = self._distance <= self._radius
-        self._inside &= ~self._fallen
-        np.copyto(self._effort_to_success, self._effort, where=self._open)
-        first: BoolArray = self._inside & self._open
+        kept, flags = self._kept, self._flags
+        kept[_NOW], kept[_RADIUS] = self._clock()
+        inside = np.less_equal(kept[_DISTANCE], kept[_RADIUS], out=flags[_INSIDE])
+        inside &= ~flags[_FALLEN]
+        np.copyto(kept[_EFFORT_TO_SUCCESS], kept[_EFFORT], where=flags[_OPEN])
+        first: BoolArray = inside & flags[_OPEN]
         if np.count_nonzero(first):
-            self._success_time[first] = self._now[first]
-            self._open = self._open & ~first
+            np.copyto(kept[_SUCCESS_TIME], kept[_NOW], where=first)
+            flags[_OPEN] &= ~first
         return first
 
     def _observation(self) -> NDArray[np.float32]:
         observation = self._blank.copy()
-        observation[:, task.STATE] = self._state.T
-        observation[:, task.TIME] = self._now
+        observation[:, task.STATE] = self._kept[_STATE].T
+        observation[:, task.TIME] = self._kept[_NOW]
         return observation
 
     def _info(self) -> dict[str, Any]:
-        # Copies of what a restart writes to; the others are made anew in every step.
+        # Copies: what is kept is written to.
+        kept, flags = self._kept.copy(), self._flags.copy()
         info = {
-            "success": ~self._open,
-            "is_success": ~self._open,
-            "success_time": self._success_time.copy(),
-            "inside_tube": self._inside,
-            "fallen": self._fallen.copy(),
-            "effort": self._effort.copy(),
-            "effort_to_success": self._effort_to_success.copy(),
-            "disturbance": self._push.copy(),
-            "tube_radius": self._radius,
-            "goal_distance": self._distance.copy(),
+            "success": ~flags[_OPEN],
+            "is_success": ~flags[_OPEN],
+            "success_time": kept[_SUCCESS_TIME],
+            "inside_tube": flags[_INSIDE],
+            "fallen": flags[_FALLEN],
+            "effort": kept[_EFFORT],
+            "effort_to_success": kept[_EFFORT_TO_SUCCESS],
+            "disturbance": np.array(self._push.T, order="C"),
+            "tube_radius": kept[_RADIUS],
+            "goal_distance": kept[_DISTANCE],
         }
         nominal = self._nominal_now()
         if nominal is not None:
-            info["tracking_error"] = task.goal_distance(self._state, nominal.T, np.sqrt)
+            info["tracking_error"] = task.goal_distance(kept[_STATE], nominal.T, np.sqrt)
         return info

@@ -23,10 +23,10 @@ from lagros_envs.values import ByValue
 FloatArray = NDArray[np.float64]
 
 # Rounding must not carry a vector of norm one over the bound.
-_INSIDE = 1.0 - 4.0 * np.finfo(np.float64).eps
-_GUST_CORRELATION_TIME = 1.0  # [s]
-_GUST_SPREAD = 0.6  # stationary norm (root mean square) as a share of the bound, before clipping
-_SINUSOID_RATES = (0.5, 5.0)  # [rad/s]
+INSIDE = 1.0 - 4.0 * np.finfo(np.float64).eps
+GUST_CORRELATION_TIME = 1.0  # [s]
+GUST_SPREAD = 0.6  # stationary norm (root mean square) as a share of the bound, before clipping
+SINUSOID_RATES = (0.5, 5.0)  # [rad/s]
 # Episodes that are worked on at once: what they draw then stays in the cache.
 _BLOCK = 64
 
@@ -70,7 +70,7 @@ def _rays(vectors: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def into_ball(vectors: FloatArray, radius: float) -> FloatArray:
     """Shorten the vectors (..., n) that are longer than the radius to the radius."""
     largest, rays, lengths = _rays(vectors)
-    limit = (_INSIDE * radius) / lengths
+    limit = (INSIDE * radius) / lengths
     return np.where(largest <= limit, vectors, rays * limit)
 
 
@@ -82,7 +82,7 @@ def into_unit_ball(vectors: FloatArray) -> FloatArray:
 def onto_unit_sphere(vectors: FloatArray, fallback: FloatArray) -> FloatArray:
     """Scale the vectors (..., n) to length one; where one is zero take the fallback."""
     largest, rays, lengths = _rays(vectors)
-    return np.where(largest > 0.0, rays * (_INSIDE / lengths), fallback)
+    return np.where(largest > 0.0, rays * (INSIDE / lengths), fallback)
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def _draw_normals(rng: np.random.Generator, numbers: FloatArray, steps: int) -> 
 
 def _directions(normals: FloatArray, count: int, channels: int) -> FloatArray:
     axis = np.zeros(channels)
-    axis[0] = _INSIDE
+    axis[0] = INSIDE
     return onto_unit_sphere(normals.reshape(*normals.shape[:-1], count, channels), axis)
 
 
@@ -139,7 +139,7 @@ def _constant(numbers: FloatArray, steps: int, channels: int, period: float) -> 
 
 def _draw_sinusoid(rng: np.random.Generator, numbers: FloatArray, steps: int) -> None:
     rng.standard_normal(out=numbers[:-2])
-    numbers[-2] = rng.uniform(*_SINUSOID_RATES)
+    numbers[-2] = rng.uniform(*SINUSOID_RATES)
     numbers[-1] = rng.uniform(0.0, 2.0 * math.pi)
 
 
@@ -157,8 +157,8 @@ def _sphere(numbers: FloatArray, steps: int, channels: int, period: float) -> Fl
 
 def _gust(numbers: FloatArray, steps: int, channels: int, period: float) -> FloatArray:
     # Exact discretisation of an Ornstein-Uhlenbeck process, begun in its stationary law.
-    decay = math.exp(-period / _GUST_CORRELATION_TIME)
-    spread = _GUST_SPREAD / math.sqrt(channels)
+    decay = math.exp(-period / GUST_CORRELATION_TIME)
+    spread = GUST_SPREAD / math.sqrt(channels)
     shocks = spread * numbers.reshape(*numbers.shape[:-1], steps, channels)
     fresh = math.sqrt(1.0 - decay * decay)
     path = np.empty_like(shocks)

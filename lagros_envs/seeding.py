@@ -104,6 +104,26 @@ def seeded_streams(seeds: Sequence[int], stream: str) -> Iterator[np.random.Gene
         yield generator
 
 
+class SharedStreams:
+    """Generators of all episodes that begin without a seed of their own.
+
+    Args:
+        source: What they are seeded from.
+
+    Attributes:
+        source: The same.
+        scenario: What starts and goals are drawn from.
+        disturbance: What disturbances are drawn from; apart, so that a larger bound, under which
+            episodes end earlier, does not shift them.
+    """
+
+    def __init__(self, source: np.random.Generator) -> None:
+        """Seed them."""
+        self.source = source
+        words = source.integers(2**63, size=(2, _POOL))
+        self.scenario, self.disturbance = map(np.random.default_rng, words)
+
+
 # The constants of NumPy's SeedSequence (O'Neill's seed_seq) and of PCG64. NumPy promises that what
 # they give never changes; a test compares the two.
 _POOL = 4  # words of 32 bits

@@ -140,11 +140,10 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         self._need_start()
         values = checked_actions(actions, (self.num_envs, task.THRUSTERS), task.ACTION)
         forces = task.applied_forces(self.settings, values)
-        restarting = self._restart_pending()
-        outcome = self.world.step(
-            forces.reshape(self.num_worlds, self.num_agents, task.THRUSTERS),
-            None if restarting is None else ~restarting,
-        )
+        restarting = self._restarting()
+        outcome = self.world.step(forces.reshape(self.num_worlds, self.num_agents, task.THRUSTERS))
+        if restarting is not None:
+            self._restart(restarting, *outcome)
         observation, info = self._after_step((outcome.terminated | outcome.truncated)[:, 0])
         return (
             observation,
@@ -195,8 +194,12 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
     def _forget_nominal(self, mask: BoolArray) -> None:
         self.world.nominal = nominal_after(self.world.nominal, mask, None)
 
-    def _start(self, worlds: IntArray, seeds: Sequence[int], given: dict[str, Any]) -> None:
+    def _start(self, worlds: IntArray, seeds: Sequence[int] | None, given: dict[str, Any]) -> None:
         stated = given.get("scenarios", [None] * self.num_worlds)
+        # To draw a scenario takes much longer than to make its generator: each has one.
+        seeds = (
+            self.np_random.integers(2**63, size=worlds.size).tolist() if seeds is None else seeds
+        )
         streams = [episode_streams(seed) for seed in seeds]
         chosen = [
             stated[world] or self.preset.sample(stream.scenario)

@@ -27,7 +27,7 @@ class Outcome(NamedTuple):
     """What one step brought each agent; every array has shape (worlds, agents).
 
     Attributes:
-        reward: See `spacecraft_task.reward`; 0 in worlds that did not move.
+        reward: See `spacecraft_task.reward`.
         terminated: Whether every agent of the world has collided.
         truncated: Whether the time limit is reached.
     """
@@ -163,6 +163,8 @@ class SpacecraftWorld:
             self.core_radius[world] = scenario.core
             self._place_obstacles(world)
             self.scenarios[world] = scenario
+            if self.disturbance.kind == "none":
+                continue
             for agent, stream in enumerate(generator.spawn(self.agents)):
                 self._pushes[world, :, :, agent] = self.disturbance.realise(
                     stream, settings.steps, settings.control_period
@@ -178,45 +180,37 @@ class SpacecraftWorld:
             array[worlds] = np.inf
         chosen = np.zeros(self.worlds, bool)
         chosen[worlds] = True
-        self._note_arrivals(self.goal_distance, chosen)
+        self._note_arrivals(self.goal_distance, chosen[:, None])
 
-    def step(self, forces: FloatArray, moving: BoolArray | None = None) -> Outcome:
+    def step(self, forces: FloatArray) -> Outcome:
         """Hold every agent's forces for one control step.
 
         Args:
             forces: u >= 0, shape (worlds, agents, 8) [N].
-            moving: Which worlds move; None for all. The others stay as they are.
 
         Returns:
             The outcome, per agent.
         """
         settings = self.settings
-        going = np.ones(self.worlds, bool) if moving is None else moving
         before = self.goal_distance
         control = np.array(np.moveaxis(forces, -1, 0), order="C")
         self.push = self._current_push()
-        if moving is not None:
-            control *= going[:, None]
-            self.push *= going[:, None]
-        path, integrated = self._advance(control, going)
+        path, integrated = self._advance(control)
         effort = np.einsum("uwa,uwa->wa", control, control) * settings.control_period
         self.forces = control
         self.effort += effort
-        self.step_count = self.step_count + going
+        self.step_count = self.step_count + 1
         hit = swept_agents(path, 2.0 * self.agent_radius)
         hit |= swept_obstacles(path, self.centres_by_agent, self.contact_by_agent)
         hit |= ~integrated
-        hit &= going[:, None]
         first_collision = hit & ~self.collided
         # The end of the step at the latest.
         self.collision_time = np.where(first_collision, self.time[:, None], self.collision_time)
         after = self.goal_distance
-        first_success = self._note_arrivals(after, going)
+        first_success = self._note_arrivals(after)
         rewards = task.reward(settings, effort, before - after, first_success, first_collision)
-        over = going & np.all(self.collided, axis=1)
-        late = going & (self.step_count >= self.step_limit)
-        if moving is not None:
-            rewards = np.where(going[:, None], rewards, 0.0)
+        over = np.all(self.collided, axis=1)
+        late = self.step_count >= self.step_limit
         return Outcome(
             rewards,
             np.repeat(over[:, None], self.agents, axis=1),
@@ -242,7 +236,7 @@ class SpacecraftWorld:
             "collision_time": self.collision_time.copy(),
             "effort": self.effort.copy(),
             "effort_to_success": self.effort_to_success.copy(),
-            "disturbance": np.ascontiguousarray(np.moveaxis(self.push, 0, -1)),
+            "disturbance": np.array(np.moveaxis(self.push, 0, -1), order="C"),
             "tube_radius": np.repeat(radius[:, None], self.agents, axis=1),
             "goal_distance": distance,
         }
@@ -287,7 +281,9 @@ class SpacecraftWorld:
         self.sight_by_agent[:, world] = (reach * np.abs(reach))[:, None]
 
     def _current_push(self) -> FloatArray:
-        """Return d of this step, a new array (6, worlds, agents)."""
+        """Return d of this step, (6, worlds, agents)."""
+        if self.disturbance.kind == "none":
+            return self.push
         # Past the time limit (a caller who ignored `truncated`) the last push stays.
         index = np.minimum(self.step_count, self.settings.steps - 1)
         push = np.moveaxis(self._pushes[self._everywhere, index], 1, 0)
@@ -301,7 +297,7 @@ class SpacecraftWorld:
         )
         return np.array(np.moveaxis(self.disturbance.respond(situation), -1, 0), order="C")
 
-    def _advance(self, control: FloatArray, going: BoolArray) -> tuple[Path, BoolArray]:
+    def _advance(self, control: FloatArray) -> tuple[Path, BoolArray]:
         """Move the states over one control step, and tell which could be integrated."""
         wrench = self.settings.system.wrench(list(control))
         duration = self.settings.control_period / SUBSTEPS
@@ -318,20 +314,24 @@ class SpacecraftWorld:
                 parts = self._hold.go_on(parts)
                 points[substep + 1] = parts[:2]
             integrated = np.all(np.abs(parts) <= task.LARGEST_STATE, axis=0)
-        kept = integrated & going[:, None]
-        if not kept.all():
+        if not integrated.all():
             # What could not be integrated stays where it was, and so does its path.
-            parts = np.where(kept, parts, self.parts)
-            points = np.where(kept, points, points[:1])
-            bulge = np.where(kept, bulge, 0.0)
+            parts = np.where(integrated, parts, self.parts)
+            points = np.where(integrated, points, points[:1])
+            bulge = np.where(integrated, bulge, 0.0)
         self.parts = parts.copy()
         return Path.through(points, bulge), integrated
 
-    def _note_arrivals(self, distance: FloatArray, worlds: BoolArray) -> BoolArray:
-        """Record the first arrivals, after the collisions, and return who just arrived."""
+    def _note_arrivals(self, distance: FloatArray, worlds: BoolArray | bool = True) -> BoolArray:
+        """Record the first arrivals, after the collisions, and return who just arrived.
+
+        Args:
+            distance: ||p - p_f||, shape (worlds, agents) [m].
+            worlds: Which worlds to look at, shape (worlds, 1); True for all.
+        """
         settings, now = self.settings, self.time[:, None]
-        eligible = ~self.collided & worlds[:, None]
-        open_ = np.isinf(self.success_time) & worlds[:, None]
+        eligible = ~self.collided & worlds
+        open_ = np.isinf(self.success_time) & worlds
         first = eligible & open_ & (distance <= settings.goal_radius)
         self.effort_to_success = np.where(open_, self.effort, self.effort_to_success)
         self.success_time = np.where(first, now, self.success_time)

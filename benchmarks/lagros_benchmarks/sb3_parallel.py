@@ -13,6 +13,8 @@ from pettingzoo import ParallelEnv
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from lagros_benchmarks.sb3_vector import world_seeds
+
 Indices = int | Iterable[int] | None
 
 
@@ -60,28 +62,32 @@ class ParallelVecEnv(VecEnv):
                     )
         super().__init__(len(self.worlds) * len(self.agents), *spaces)
         self._np_random, _ = seeding.np_random(None)
+        self._first: list[int] | None = None
         self._actions: NDArray[Any] | None = None
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, dtype=np.intp)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seed from which all episodes from now on draw their own.
+        """Set the seed of the next reset, from which all later episodes draw theirs, too.
 
         Args:
             seed: Non-negative integer, or None for a random one.
 
         Returns:
-            The seed once per row.
+            The seed of each row's world, as stable-baselines3 seeds environments: one more for
+            each world.
         """
-        self._np_random, _ = seeding.np_random(seed)
-        return [seed] * self.num_envs
+        self._first = world_seeds(seed, len(self.worlds))
+        self._np_random, _ = seeding.np_random(self._first[0])
+        return np.repeat(self._first, len(self.agents)).tolist()
 
     def reset(self) -> NDArray[np.float32]:
         """Start an episode in every world and return the observations (rows, n)."""
         self._returns[:] = 0.0
         self._lengths[:] = 0
         self.reset_infos = [{} for _ in range(self.num_envs)]
-        return np.stack(self._begin(range(len(self.worlds))))
+        first, self._first = self._first, None
+        return np.stack(self._begin(range(len(self.worlds)), first))
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Store the actions (rows, m) of the coming step."""
@@ -173,9 +179,11 @@ class ParallelVecEnv(VecEnv):
         count = len(self.agents)
         return [self.worlds[int(row) // count] for row in self._get_indices(indices)]
 
-    def _begin(self, indices: Sequence[int]) -> list[NDArray[np.float32]]:
+    def _begin(
+        self, indices: Sequence[int], seeds: list[int] | None = None
+    ) -> list[NDArray[np.float32]]:
         """Start an episode in some worlds and return the observations of their agents."""
-        words = self._np_random.integers(2**63, size=len(indices)).tolist()
+        words = seeds or self._np_random.integers(2**63, size=len(indices)).tolist()
         rows = []
         for index, word in zip(indices, words, strict=True):
             observations, infos = self.worlds[index].reset(seed=word)

@@ -16,6 +16,12 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 Indices = int | Iterable[int] | None
 
 
+def world_seeds(seed: int | None, worlds: int) -> list[int]:
+    """Return seed, seed + 1, ... for the worlds; from a random one if there is none."""
+    first = int(np.random.default_rng().integers(2**32)) if seed is None else int(seed)
+    return list(range(first, first + worlds))
+
+
 class SB3VectorEnv(VecEnv):
     """A Gymnasium vector environment in same-step autoreset mode, as stable-baselines3 wants it.
 
@@ -48,16 +54,19 @@ class SB3VectorEnv(VecEnv):
         self._lengths = np.zeros(self.num_envs, dtype=np.intp)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seed of the next reset; the worlds draw independent seeds from it.
+        """Set the seed of the next reset.
 
         Args:
             seed: Non-negative integer, or None for a random one.
 
         Returns:
-            The seed once per world; each world's own is drawn from it at the reset.
+            The seed of each row's world, as stable-baselines3 seeds environments: one more for
+            each world.
         """
-        self._seed = seed
-        return [seed] * self.num_envs
+        worlds = getattr(self.venv.unwrapped, "num_worlds", self.num_envs)
+        seeds = world_seeds(seed, worlds)
+        self._seed = seeds[0]
+        return np.repeat(seeds, self.num_envs // worlds).tolist()
 
     def reset(self) -> NDArray[np.float32]:
         """Start an episode in every world and return the observations (worlds, n)."""

@@ -40,7 +40,7 @@ def test_rows_are_those_of_the_batched_world():
     """Over several episodes, some of which end because every agent has collided."""
     ours, theirs = parallel(preset="released"), batched(preset="released")
     for env in (ours, theirs):
-        assert env.seed(7) == [7] * (WORLDS * AGENTS)
+        assert env.seed(7) == [7 + world for world in range(WORLDS) for _ in range(AGENTS)]
     np.testing.assert_array_equal(ours.reset(), theirs.reset())
     rng = np.random.default_rng(0)
     early = late = 0
@@ -102,7 +102,7 @@ def test_seeds_repeat_and_worlds_and_episodes_differ():
 
     first = episodes(1)
     np.testing.assert_array_equal(episodes(1), first)
-    everything = np.concatenate([*first, *episodes(2)])
+    everything = np.concatenate([*first, *episodes(20)])
     assert len(np.unique(everything[:, 0])) == 4 * 5 * AGENTS
 
 

@@ -138,16 +138,27 @@ def same_info(infos, info, world):
         )
 
 
-def test_an_integer_seed_gives_worlds_that_differ_and_repeat():
-    envs = vector(64, disturbance="uniform")
-    first, _ = envs.reset(seed=5)
-    assert len(np.unique(first[:, 1])) == 64
-    assert len(np.unique(first[:, 4])) == 64
-    np.testing.assert_array_equal(envs.reset(seed=5)[0], first)
-    np.testing.assert_array_equal(envs.reset(seed=np.int64(5))[0], first)
-    assert not np.array_equal(envs.reset(seed=6)[0], first)
-    # Not seed + i: neighbouring seeds share no world.
-    assert not np.intersect1d(envs.reset(seed=6)[0][:, 1], first[:, 1]).size
+@pytest.mark.parametrize("kind", ["none", "uniform"])
+def test_an_integer_seed_is_that_of_gymnasium(kind):
+    envs = vector(4, disturbance=kind)
+    sync = SyncVectorEnv([lambda: CartPoleEnv(disturbance=kind) for _ in range(4)])
+    for seed in (5, np.int64(5), 2**63):
+        np.testing.assert_array_equal(envs.reset(seed=seed)[0], sync.reset(seed=int(seed))[0])
+    actions = np.full((4, 1), 0.1, np.float32)
+    ours, theirs = envs.step(actions), sync.step(actions)
+    np.testing.assert_allclose(ours[0], theirs[0], rtol=1e-6)
+    np.testing.assert_array_equal(ours[4]["disturbance"], theirs[4]["disturbance"])
+    with pytest.raises(ValueError, match="seed=-1"):
+        envs.reset(seed=-1)
+
+
+def test_a_seed_of_none_in_a_list_leaves_that_world_without():
+    envs = vector(3)
+    observations = [envs.reset(seed=[7, None, 9])[0] for _ in range(2)]
+    np.testing.assert_array_equal(*observations)
+    single = CartPoleEnv()
+    np.testing.assert_array_equal(observations[0][2], single.reset(seed=9)[0])
+    assert len(np.unique(observations[0][:, 1])) == 3
 
 
 def test_without_a_seed_the_worlds_go_on_drawing():
@@ -204,53 +215,46 @@ def test_what_a_step_returns_is_not_changed_by_the_next(mixed):
 # Autoreset, against Gymnasium's SyncVectorEnv over the single environment.
 
 
-class Chains:
-    """Stands in for the vector environment's generator: the seeds that the single ones draw.
+class Follower(CartPoleEnv):
+    """A single environment that starts where, and is pushed as, a world of the vectorised one."""
 
-    A `CartPoleEnv` that was reset with a seed draws the seeds of its further episodes from its own
-    generator, which SyncVectorEnv so uses; the vector environment has one generator for all
-    worlds. With these seeds in its place, all later episodes can be compared, too.
-    """
+    def __init__(self, envs, world):
+        super().__init__(lambda now: self.push, disturbance_bound=0.5)
+        self.envs, self.world, self.push = envs, world, np.zeros(4)
 
-    def __init__(self, seeds):
-        self.generators = [gym.utils.seeding.np_random(seed)[0] for seed in seeds]
-        self.worlds = []
-
-    def integers(self, high, size):
-        assert high == 2**63
-        assert size == len(self.worlds)
-        return np.array([self.generators[world].integers(high) for world in self.worlds])
+    def reset(self, *, seed=None, options=None):
+        if seed is None:
+            names = {"initial_state": self.envs.state, "goal": self.envs._goal.T}
+            options = {name: values[self.world] for name, values in names.items()}
+        return super().reset(seed=seed, options=options)
 
 
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])
-def test_autoreset_is_that_of_gymnasium(mode, mixed):
-    change = {"disturbance": "uniform", "disturbance_bound": 0.5}
+@pytest.mark.parametrize("kind", ["none", "uniform", "gust"])
+def test_autoreset_is_that_of_gymnasium(mode, kind, mixed):
+    envs = vector(disturbance=kind, disturbance_bound=0.5, autoreset_mode=mode).unwrapped
     sync = SyncVectorEnv(
-        [lambda: CartPoleEnv(**change) for _ in SEEDS], autoreset_mode=AutoresetMode[mode.upper()]
+        [lambda world=world: Follower(envs, world) for world in range(WORLDS)],
+        autoreset_mode=AutoresetMode[mode.upper()],
     )
-    envs = vector(autoreset_mode=mode, **change).unwrapped
     assert envs.metadata["autoreset_mode"] == sync.metadata["autoreset_mode"]
     expected, _ = sync.reset(seed=SEEDS)
     observations, _ = envs.reset(seed=SEEDS)
     np.testing.assert_array_equal(observations, expected)
-    envs.np_random = chains = Chains(SEEDS)
     restarts, late_ends = 0, 0
-    ended = np.zeros(WORLDS, bool)
     for step in range(250):
-        states = np.stack([env.state for env in sync.envs])
-        goals = np.stack([env.scenario.goal for env in sync.envs])
-        actions = mixed.batch(states, goals)
-        ours = mixed.batch(envs.state, goals)
-        wanted = sync.step(actions)
-        wanted_ended = wanted[2] | wanted[3]
-        # Next-step autoreset restarts on the call after the end; same-step at once.
-        chains.worlds = np.flatnonzero(ended if mode == "next_step" else wanted_ended)
-        result = envs.step(ours)
-        ended = wanted_ended
+        goals = envs._goal.T.copy()
+        theirs = mixed.batch(np.stack([env.state for env in sync.envs]), goals)
+        result = envs.step(mixed.batch(envs.state, goals))
+        moved = result[4].get("final_info", result[4])["disturbance"]
+        for env, push in zip(sync.envs, moved, strict=True):
+            env.push = push
+        wanted = sync.step(theirs)
         np.testing.assert_allclose(result[0], wanted[0], rtol=1e-6, atol=1e-7)
         for column in (1, 2, 3):
             close(result[column], wanted[column])
         close(envs.state, np.stack([env.state for env in sync.envs]))
+        ended = wanted[2] | wanted[3]
         compare_infos(result[4], wanted[4], ended if mode == "same_step" else None)
         if mode == "same_step":
             assert ("final_obs" in result[4]) == ended.any()
@@ -258,6 +262,46 @@ def test_autoreset_is_that_of_gymnasium(mode, mixed):
         late_ends += ended.sum() if step > 100 else 0
     assert restarts > 10
     assert late_ends > 5
+
+
+@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+@pytest.mark.parametrize("kind", sorted(OPEN_LOOP))
+def test_episodes_begun_by_autoreset_repeat_from_one_seed(mode, kind):
+    def flight(seed):
+        envs = vector(5, disturbance=kind, autoreset_mode=mode)
+        rng = np.random.default_rng(0)
+        found = [envs.reset(seed=seed)[0]]
+        found += [envs.step(rng.uniform(-1.0, 1.0, (5, 1)))[0] for _ in range(40)]
+        return np.stack(found)
+
+    first = flight(3)
+    np.testing.assert_array_equal(flight(3), first)
+    starts = first[first[:, :, 12] == 0.0][5:]
+    assert len(starts) > 10
+    assert len(np.unique(starts[:, 1])) == len(starts)
+    assert not np.intersect1d(starts[:, 1], flight(4)[:, :, 1]).size
+
+
+def test_what_a_world_meets_does_not_depend_on_when_the_others_end():
+    """Two bounds: other ends, other starts, and the same realisation, larger."""
+
+    def pushes(bound, kind):
+        envs = vector(8, disturbance=kind, disturbance_bound=bound, autoreset_mode="same_step")
+        envs.reset()
+        envs.reset(seed=[None] * 8)
+        envs.unwrapped.np_random = np.random.default_rng(1)
+        envs.reset()
+        found, ends = [], []
+        for _ in range(30):
+            *_, info = envs.step(np.zeros((8, 1)))
+            found.append(info.get("final_info", info)["disturbance"])
+            ends.append(info.get("_final_info", np.zeros(8, bool)))
+        return np.stack(found), np.stack(ends)
+
+    for kind in ("uniform", "sphere"):
+        (small, few), (large, many) = pushes(0.3, kind), pushes(2.4, kind)
+        assert np.any(few != many)
+        np.testing.assert_allclose(8.0 * small, large, rtol=1e-12)
 
 
 def compare_infos(infos, wanted, ended):

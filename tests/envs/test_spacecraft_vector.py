@@ -79,13 +79,28 @@ def compare(world, agents, ours, theirs):
             )
 
 
-def test_an_integer_seed_gives_worlds_that_differ_and_repeat():
-    envs = vector(16, 2)
+def test_an_integer_seed_is_that_of_gymnasium_world_by_world():
+    envs = vector(16, 2, disturbance="uniform")
     first, _ = envs.reset(seed=5)
+    np.testing.assert_array_equal(envs.reset(seed=list(range(5, 21)))[0], first)
+    single = spacecraft_v0.parallel_env(num_agents=2, disturbance="uniform")
+    observations, _ = single.reset(seed=7)
+    np.testing.assert_array_equal(first[4:6], np.stack(list(observations.values())))
     assert len(np.unique(first[:, 0])) == 32
-    np.testing.assert_array_equal(envs.reset(seed=5)[0], first)
-    assert not np.intersect1d(envs.reset(seed=6)[0][:, 0], first[:, 0]).size
     assert not np.intersect1d(envs.reset()[0][:, 0], first[:, 0]).size
+
+
+def test_a_world_that_starts_anew_is_brought_nothing_by_the_step():
+    envs = vector(3, 2, settings=SHORT, disturbance="uniform")
+    envs.reset(seed=0)
+    strong = np.ones((6, 8), np.float32)
+    while not envs.step(strong)[3].any():
+        pass
+    _, reward, terminated, truncated, info = envs.step(strong)
+    assert not any(part.any() for part in (reward, terminated, truncated))
+    for name in ("effort", "effort_to_success", "disturbance", "collided", "tube_radius"):
+        assert not info[name].any(), name
+    assert np.all(envs.step(strong)[4]["effort"] > 0.0)
 
 
 @pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])

@@ -475,21 +475,6 @@ def test_agents_may_be_numbered_in_any_order(fly):
     np.testing.assert_array_equal(one.collision_time[0, order], other.collision_time[0])
 
 
-def test_worlds_that_do_not_move_stay_as_they_are():
-    disturbance = Disturbance("uniform", 0.4, ALL)
-    world = SpacecraftWorld(3, 2, 6, disturbance, SpacecraftSettings())
-    scenarios = [PRESETS["paper"].sample(episode_streams(k).scenario, 2) for k in range(3)]
-    world.begin(np.arange(3), scenarios, [episode_streams(k).disturbance for k in range(3)])
-    before = world.states
-    outcome = world.step(np.ones((3, 2, 8)), np.array([True, False, True]))
-    assert np.all(world.states[[0, 2]] != before[[0, 2]])
-    np.testing.assert_array_equal(world.states[1], before[1])
-    np.testing.assert_array_equal(world.step_count, [1, 0, 1])
-    assert not outcome.reward[1].any()
-    assert not world.effort[1].any()
-    assert not world.info()["disturbance"][1].any()
-
-
 def test_scenarios_that_do_not_fit_the_world_are_refused():
     world = SpacecraftWorld(1, 2, 1, NONE, SpacecraftSettings())
     streams = [episode_streams(0).disturbance]

@@ -8,12 +8,9 @@ import pytest
 
 import lagros_envs  # noqa: F401  registers the environment
 from lagros_envs.cartpole_task import CartPoleSettings, StepMeasure
-from lagros_envs.disturbances import Disturbance
 from lagros_envs.dynamics.held import HeldBatch
 from lagros_envs.scenarios import Scenario
-from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
-from lagros_envs.spacecraft_world import SpacecraftWorld
 from lagros_envs.sweep import Path, swept_agents
 
 FAR = Scenario([[0.0, 0.0], [0.0, 4.0]], [0.0, 0.0], [[4.0, 0.0], [4.0, 4.0]], [], [])
@@ -43,21 +40,6 @@ def test_a_new_episode_forgets_every_success_of_the_last():
         assert info[name].tolist() == [False, False]
     for name in ("success_time", "paper_success_time", "collision_time"):
         assert np.isinf(info[name]).all()
-
-
-def test_a_world_that_does_not_move_stays_as_it_is():
-    calm = Disturbance("none", 0.0, (True,) * 6)
-    world = SpacecraftWorld(2, 2, 0, calm, SpacecraftSettings())
-    streams = [np.random.default_rng(index) for index in range(2)]
-    world.begin(np.arange(2), [FAR, FAR], streams)
-    world.parts[3:] = 0.5  # all of them drift and turn
-    world.parts[:2, 1] = 2.0  # and those of the second world overlap
-    before = world.states
-    world.step(np.ones((2, 2, 8)), np.array([True, False]))
-    assert np.all(np.any(world.states[0] != before[0], axis=-1))
-    np.testing.assert_array_equal(world.states[1], before[1])
-    assert world.time.tolist() == [0.1, 0.0]
-    assert not world.collided.any()
 
 
 def test_a_world_whose_agents_have_all_collided_starts_anew_and_alone():
