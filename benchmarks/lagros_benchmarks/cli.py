@@ -18,7 +18,7 @@ from lagros_benchmarks.certify import certify
 from lagros_benchmarks.data import data
 from lagros_benchmarks.export import export
 from lagros_benchmarks.extras import check_extra
-from lagros_benchmarks.outputs import policy_files
+from lagros_benchmarks.outputs import check_outputs, policy_files
 from lagros_benchmarks.streams import printing_failed
 from lagros_benchmarks.terminal import (
     INTERRUPTED,
@@ -270,7 +270,8 @@ def reproduce(
         workers = Backend(backend, address)
         wanted = _reproduction(task, episodes, jobs, workers)
         outputs = _reproduced(task, place)
-        outputs.check(task, folders={"--out": folder})
+        check_outputs({}, folders={"--out": place})
+        outputs.check(task)
         with progress_bar() as progress, running(workers, jobs):
             benchmark = (
                 wanted.benchmark(None)

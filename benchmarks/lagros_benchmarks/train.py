@@ -16,7 +16,7 @@ import typer
 
 from lagros_benchmarks.extras import check_extra
 from lagros_benchmarks.outputs import Delivery, check_outputs
-from lagros_benchmarks.terminal import fail, listed
+from lagros_benchmarks.terminal import INTERRUPTED, fail, listed
 
 if TYPE_CHECKING:
     from lagros_benchmarks.training.settings import Training
@@ -99,11 +99,9 @@ def train(
             from lagros_benchmarks.canvas import check_figure_path
 
             check_figure_path(figure)
-        places = [folder_of(run, out) for run in runs]
+        kept = [folder_of(run, out) / name for run in runs for name in KEPT]
         check_outputs(
-            {"--json": json, "--figure": figure},
-            {f"the run in {place}": place / name for place in places for name in KEPT},
-            {f"--out, seed {run.seed}": folder_of(run, out) for run in runs},
+            {**{f"--out ({path})": path for path in kept}, "--json": json, "--figure": figure}
         )
     except ValueError as error:
         fail(str(error).replace("largest_correction", "--residual"))
@@ -115,6 +113,8 @@ def train(
     except (ImportError, ValueError, OSError) as error:
         # An extra that is not installed, a folder of another run, a full disk.
         fail(error, status=1)
+    except KeyboardInterrupt:
+        fail(f"interrupted; the same command goes on with what is in {out}", status=INTERRUPTED)
     _write_curves(records, json, figure).tell()
 
 
