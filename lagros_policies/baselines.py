@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
-from lagros_envs.checks import check_positive
+from lagros_envs.checks import check_positive, check_seed
 from lagros_envs.dynamics import linearise_hold
 from lagros_policies.observed import cartpole_rows
 
@@ -113,6 +113,9 @@ class RandomPolicy:
     Args:
         settings: The task; None for the paper's. The policy does not look at it.
         seed: Seed of the generator.
+
+    Raises:
+        ValueError: The seed is no whole number, or negative.
     """
 
     observes: Observes = "local"
@@ -121,6 +124,7 @@ class RandomPolicy:
         """Seed the generator; see the class for the arguments."""
         self.name = "random"
         self.settings = settings or task.CartPoleSettings()
+        check_seed(seed)
         self._rng = np.random.default_rng(seed)
 
     def predict(

@@ -164,7 +164,7 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
                 memory.estimate, memory.state, memory.wanted, state, nominal
             )
         memory.step, memory.state, memory.wanted = step, state.copy(), wanted
-        return self._applied(self.adaptive.corrected(state, wanted, memory.estimate))
+        return self.adaptive.corrected(state, wanted, memory.estimate)
 
 
 class SlidingCentralizedPolicy(CentralizedPolicy):

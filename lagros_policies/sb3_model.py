@@ -16,6 +16,7 @@ from lagros_envs.observation import Layout
 from lagros_envs.reading import check_file, parse_json
 from lagros_envs.scenarios import Preset, preset_named
 from lagros_policies.naming import ALGORITHMS
+from lagros_policies.observed import as_numbers
 
 Float32Array = NDArray[np.float32]
 
@@ -69,10 +70,15 @@ class StableBaselines3Policy:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, Any]:
-        """Return the model's action and state; see `Policy.predict`."""
-        action, state = self.model.predict(
-            np.asarray(observation, np.float32), state, episode_start, deterministic
-        )
+        """Return the model's action and state; see `Policy.predict`.
+
+        Raises:
+            ValueError: The observation is not one of the task, or not finite.
+        """
+        rows = as_numbers(observation, np.float32)
+        if not np.isfinite(rows).all():
+            raise ValueError("the observation is not finite")
+        action, state = self.model.predict(rows, state, episode_start, deterministic)
         return np.asarray(action, np.float32), state
 
 

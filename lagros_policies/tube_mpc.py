@@ -19,6 +19,7 @@ from lagros_policies.contraction import ContractionMetric, load_metric
 from lagros_policies.expert import CartPoleExpert, TrackedPlans
 from lagros_policies.observed import cartpole_rows
 from lagros_policies.planning import Trajectory
+from lagros_policies.planning.cartpole import FORCE_SLACK
 from lagros_policies.policy import PolicyState, row_memories
 from lagros_policies.trained_for import cartpole_design, check_trained_for
 
@@ -42,6 +43,7 @@ class TubeMpcState:
         failed_plans: Plans that did not hold; the last one stayed in force.
         late_plans: Plans that took longer than the deadline; the last one stayed in force.
         newest: Control step of the last call; -1 before the first.
+        saturated_steps: Control steps at which u* asked for more than the force limit.
     """
 
     plan: Trajectory | None = None
@@ -51,6 +53,7 @@ class TubeMpcState:
     failed_plans: int = 0
     late_plans: int = 0
     newest: int = -1
+    saturated_steps: int = 0
 
 
 class TubeMpcPolicy:
@@ -122,14 +125,23 @@ class TubeMpcPolicy:
         # Copies: what was returned before stays what it was.
         fresh = [TubeMpcState() if memory is None else copy(memory) for memory in memories]
         force = np.array(
-            [self._force(row, memory) for row, memory in zip(rows, fresh, strict=True)]
+            [
+                self._applied(self._force(row, memory), memory)
+                for row, memory in zip(rows, fresh, strict=True)
+            ]
         )
         action = (force / self.settings.force_scale).astype(np.float32)
         return (action if np.ndim(observation) == 2 else action[0]), fresh
 
     def counters(self, state: PolicyState) -> dict[str, int]:
-        """Return how many plans were made, failed and were late, over the episodes of a state."""
-        names = ("plans", "failed_plans", "late_plans")
+        """Return how many plans were made, failed and were late, over the episodes of a state.
+
+        Where the task has a force limit, `saturated_steps` are the control steps at which u* asked
+        for more.
+        """
+        names = ["plans", "failed_plans", "late_plans"]
+        if self.settings.force_limit is not None:
+            names.append("saturated_steps")
         return {name: sum(getattr(memory, name) for memory in state) for name in names}
 
     def _force(self, row: FloatArray, memory: TubeMpcState) -> FloatArray:
@@ -151,12 +163,15 @@ class TubeMpcPolicy:
             return np.zeros(1)
         state = row[None, task.STATE]
         force = self.expert.control(memory.tracked, np.zeros(1, int), np.full(1, step), state)
-        return self._applied(force.reshape(1))
+        return force.reshape(1)
 
-    def _applied(self, force: FloatArray) -> FloatArray:
-        """Return what the task's limit leaves of a force (1,) [N]."""
+    def _applied(self, force: FloatArray, memory: TubeMpcState) -> FloatArray:
+        """Return what the limit leaves of a force (1,) [N], and count where it takes some."""
         limit = self.settings.force_limit
-        return force if limit is None else np.clip(force, -limit, limit)
+        if limit is None:
+            return force
+        memory.saturated_steps += bool(abs(force[0]) > limit + FORCE_SLACK)
+        return np.clip(force, -limit, limit)
 
     def _renew(self, row: FloatArray, goal: FloatArray, step: int, memory: TubeMpcState) -> None:
         plan = memory.plan

@@ -17,6 +17,9 @@ from lagros_policies.planning.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 
+# By so much a solver may exceed the force limit [N].
+FORCE_SLACK = 1e-6
+
 
 @dataclass(frozen=True, slots=True)
 class CartPolePlannerSettings:
@@ -119,8 +122,10 @@ class CartPolePlanner:
         if guess is not None:
             warm = guess.states[-(horizon + 1) :], guess.controls[-horizon:]
         ends = np.asarray(initial_state, np.float64), np.asarray(goal, np.float64)
+        if guess is not None and np.max(np.abs(guess.controls)) <= self._largest + FORCE_SLACK:
+            return self._limited.solve(*ends, -high, high, warm)
         plan = self._solver.solve(*ends, -high, high, warm)
-        if not plan.solved or np.max(np.abs(plan.controls)) <= self._largest:
+        if not plan.solved or np.max(np.abs(plan.controls)) <= self._largest + FORCE_SLACK:
             return plan
         # From a straight line the linearised dynamics may ask for more than the limit.
         return self._limited.solve(*ends, -high, high, (plan.states, plan.controls))

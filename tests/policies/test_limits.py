@@ -1,5 +1,7 @@
 """Limits of force and thrust bind the plans; where there is none for that, it is counted."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -49,6 +51,21 @@ def test_a_force_too_small_to_catch_the_pole_leaves_no_plan():
     plan = planned(5.0)
     assert not plan.solved
     assert "failed" in plan.status or "trust" in plan.status
+
+
+def test_where_the_feedback_meets_the_limit_is_counted():
+    env = CartPoleEnv(settings=CartPoleSettings(force_limit=8.0))
+    policy: Any = make("tube-mpc", env, deadline=1e9)
+    observation, _ = env.reset(options={"initial_state": [0, 0.3, 0, 0], "goal": 0.5})
+    action, state = policy.predict(observation)
+    assert policy.counters(state)["saturated_steps"] == 0
+    observation, *_ = env.step(action)
+    observation[1] += 0.5  # the angle, as after a push
+    action, state = policy.predict(observation, state)
+    assert policy.counters(state)["saturated_steps"] == 1
+    assert abs(float(action[0])) * 40.0 == pytest.approx(8.0)
+    plain: Any = make("tube-mpc", CartPoleEnv(), deadline=1e9)
+    assert "saturated_steps" not in plain.counters(plain.predict(observation)[1])
 
 
 @pytest.mark.parametrize("limit", [5.0, 20.0])
