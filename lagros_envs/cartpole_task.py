@@ -15,11 +15,18 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_fields, check_multiple, check_not_negative, check_positive
+from lagros_envs.checks import (
+    LARGEST,
+    check_at_most,
+    check_fields,
+    check_multiple,
+    check_not_negative,
+    check_positive,
+)
 from lagros_envs.dynamics import CartPole
 from lagros_envs.options import nominal_option, option_numbers
 from lagros_envs.tube import PaperTube
-from lagros_envs.values import ByValue
+from lagros_envs.values import ByValue, use_plain_numbers
 
 FloatArray = NDArray[np.float64]
 
@@ -81,13 +88,17 @@ class CartPoleSettings:
     def __post_init__(self) -> None:
         """Check the values."""
         check_fields(self)
+        use_plain_numbers(self)
         for item in fields(self):
             if item.type == "float":
                 check_not_negative(item.name, getattr(self, item.name))
+                most = LARGEST_FORCE if item.name.startswith("force") else LARGEST
+                check_at_most(item.name, getattr(self, item.name), most)
         for name in ("control_period", "time_limit", "force_scale"):
             check_positive(name, getattr(self, name))
         if self.force_limit is not None:
             check_positive("force_limit", self.force_limit, "or None for no limit")
+            check_at_most("force_limit", self.force_limit, LARGEST_FORCE, "or None for no limit")
         if self.initial_angle >= FALL_ANGLE:
             raise ValueError(f"initial_angle={self.initial_angle!r} must be below pi/2")
         check_multiple("time_limit", self.time_limit, "control_period", self.control_period)
@@ -208,7 +219,8 @@ def named_space(settings: CartPoleSettings) -> spaces.Dict:
             state=box(*unbounded),
             goal=box(*unbounded),
             initial_state=box(*unbounded),
-            time=box([0.0], [settings.time_limit]),
+            # As the last step computes it, which may differ in the last digit.
+            time=box([0.0], [settings.steps * settings.control_period]),
         )
     )
 

@@ -20,6 +20,9 @@ from typing import Any, Literal, TypeGuard, Union, get_args, get_origin, get_typ
 MOST_STEPS = 1_000_000
 # As much as NumPy recommends as the entropy of a seed.
 MOST_SEEDS = 1 << 128
+# Of a coordinate, a size, a rate or a weight: observations hold it in single precision, and no
+# distance comes near what counts as diverged.
+LARGEST = 1e9
 # Letters of a value in a message; a longer one is cut.
 _SHOWN = 80
 
@@ -65,6 +68,15 @@ def check_above(name: str, value: float, bound: float, otherwise: str = "") -> N
         ValueError: It is no number, `bound` or less, or NaN.
     """
     _check(is_number(value) and value > bound, name, value, f"> {bound}", otherwise)
+
+
+def check_at_most(name: str, value: float, most: float, otherwise: str = "") -> None:
+    """Check a number against the most that it may be; the rest as in `check_positive`.
+
+    Raises:
+        ValueError: It is no number, more than `most`, or NaN.
+    """
+    _check(is_number(value) and value <= most, name, value, f"at most {most:g}", otherwise)
 
 
 def check_fields(settings: Any) -> None:
@@ -263,7 +275,10 @@ def _unmet(value: object, hint: Any) -> str:
         return "" if isinstance(value, bool) else "True or False"
     if hint is types.NoneType:
         return "" if value is None else "None"
-    if hint in (str, Path) or is_dataclass(hint):
+    if is_dataclass(hint):
+        # No subclass: written as JSON, it would come back as its base.
+        return "" if type(value) is hint else f"a {hint.__name__}"  # type: ignore[union-attr]
+    if hint in (str, Path):
         return "" if isinstance(value, hint) else f"a {'text' if hint is str else hint.__name__}"
     return ""
 

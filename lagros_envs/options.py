@@ -12,13 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import shown, suggestion
+from lagros_envs.checks import LARGEST, shown, suggestion
 
 FloatArray = NDArray[np.float64]
-
-# What options state, in units of the state: single precision still tells centimetres apart there,
-# and no distance comes near what counts as diverged.
-LARGEST_OPTION = 1e6
 
 
 def known_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) -> dict[str, Any]:
@@ -98,11 +94,11 @@ def option_numbers(
         )
     counted = numbers if looked_at is None else numbers[looked_at]
     # A comparison with nan is false.
-    wrong = ~(np.abs(counted) <= LARGEST_OPTION)
+    wrong = ~(np.abs(counted) <= LARGEST)
     if wrong.any():
         raise ValueError(
             f"options[{name!r}] holds {counted[wrong][0]:g}; it must be finite, and no number "
-            f"beyond +-{LARGEST_OPTION:g}"
+            f"beyond +-{LARGEST:g}"
         )
     return numbers
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import (
+    LARGEST,
     check_fields,
     check_not_negative,
     check_positive,
@@ -24,7 +25,7 @@ from lagros_envs.conventions import built_like
 from lagros_envs.files import write_atomic
 from lagros_envs.reachable import way_exists
 from lagros_envs.reading import Record
-from lagros_envs.values import ByValue
+from lagros_envs.values import ByValue, use_plain_numbers
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -33,7 +34,6 @@ FORMAT = "lagros-scenario-1"
 ATTEMPTS = 1000  # of a whole scenario, before the density is called impossible
 DRAWS = 16  # of one obstacle, start or goal at a time ...
 ROUNDS = 12  # ... and how often, before the attempt is given up
-LARGEST = 1e9  # of a coordinate and a radius [m]
 MOST_AGENTS, MOST_OBSTACLES = 1000, 10_000  # all pairs of them are looked at
 GRID = 0.15  # cell of the grid on which a way is looked for [m]
 
@@ -219,6 +219,7 @@ class Preset:
     def __post_init__(self) -> None:
         """Check the values."""
         check_fields(self)
+        use_plain_numbers(self)
         for name in ("arena", "obstacle_radius", "agent_radius"):
             check_positive(name, getattr(self, name))
         check_not_negative("core_radius", self.core, "or None for agent_radius")

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import (
+    LARGEST,
+    check_at_most,
     check_fields,
     check_multiple,
     check_not_negative,
@@ -21,6 +23,7 @@ from lagros_envs.checks import (
 from lagros_envs.dynamics.spacecraft import Spacecraft
 from lagros_envs.options import nominal_option
 from lagros_envs.tube import PaperTube
+from lagros_envs.values import use_plain_numbers
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -80,13 +83,17 @@ class SpacecraftSettings:
     def __post_init__(self) -> None:
         """Check the values."""
         check_fields(self)
+        use_plain_numbers(self)
         for item in fields(self):
             if item.type == "float":
                 check_not_negative(item.name, getattr(self, item.name))
+                most = LARGEST_FORCE if item.name.startswith("thrust") else LARGEST
+                check_at_most(item.name, getattr(self, item.name), most)
         for name in ("control_period", "horizon", "time_limit", "goal_radius", "thrust_scale"):
             check_positive(name, getattr(self, name))
         if self.thrust_limit is not None:
             check_positive("thrust_limit", self.thrust_limit, "or None for no limit")
+            check_at_most("thrust_limit", self.thrust_limit, LARGEST_FORCE, "or None for no limit")
         for name in ("horizon", "time_limit"):
             check_multiple(name, getattr(self, name), "control_period", self.control_period, 1e-6)
 

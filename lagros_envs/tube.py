@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from lagros_envs.checks import check_fields, check_positive
+from lagros_envs.checks import LARGEST, check_at_most, check_fields, check_positive
+from lagros_envs.values import use_plain_numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +33,10 @@ class PaperTube:
     def __post_init__(self) -> None:
         """Check the values."""
         check_fields(self)
+        use_plain_numbers(self)
         for name in ("steady_radius", "contraction_rate"):
             check_positive(name, getattr(self, name))
+            check_at_most(name, getattr(self, name), LARGEST)
 
     def radius(self, time: Any) -> Any:
         """Return r(t) for a time, or an array of times, [s]."""

@@ -1,4 +1,4 @@
-"""Frozen dataclasses that hold arrays: equal by value, hashable, and read-only as copies, too."""
+"""Frozen dataclasses as values: equal, hashed and written by what they hold, and never changed."""
 
 from __future__ import annotations
 
@@ -47,3 +47,26 @@ def _hashable(value: Any) -> Hashable:
         return value.shape, value.dtype.str, (value + 0).tobytes()
     hashable: Hashable = value
     return hashable
+
+
+def use_plain_numbers(settings: Any) -> None:
+    """Turn NumPy's numbers in a frozen dataclass into Python's, and lists into tuples.
+
+    So that settings are equal, hashed and written as JSON by what they say.
+
+    Args:
+        settings: The dataclass, while it is being built.
+    """
+    for item in fields(settings):
+        value = getattr(settings, item.name)
+        plain = _plain(value)
+        if plain is not value:
+            object.__setattr__(settings, item.name, plain)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, list | tuple):
+        return tuple(_plain(one) for one in value)
+    return value

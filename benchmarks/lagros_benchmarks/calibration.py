@@ -291,5 +291,10 @@ def _built(policy: str, expert: CartPoleExpert) -> Any:
 
     import lagros_envs  # noqa: F401  (registers the environment)
 
-    env = gym.make("lagros/CartPole-v0", settings=expert.task, disable_env_checker=True)
+    env = gym.make(
+        "lagros/CartPole-v0",
+        settings=expert.task,
+        max_episode_steps=expert.task.steps,
+        disable_env_checker=True,
+    )
     return make(policy, env)

@@ -5,8 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from lagros_envs.checks import check_fields, check_not_negative, check_positive
+from lagros_envs.checks import (
+    LARGEST,
+    check_at_least,
+    check_at_most,
+    check_fields,
+    check_not_negative,
+    check_positive,
+)
 from lagros_envs.dynamics.system import Components
+from lagros_envs.values import use_plain_numbers
 
 POSITION, ANGLE, VELOCITY, ANGULAR_RATE = range(4)
 
@@ -40,9 +48,16 @@ class CartPole:
     def __post_init__(self) -> None:
         """Check that the parameters are physical."""
         check_fields(self)
+        use_plain_numbers(self)
         for field in fields(self):
-            check = check_not_negative if field.name.endswith("friction") else check_positive
-            check(field.name, getattr(self, field.name))
+            value = getattr(self, field.name)
+            if field.name.endswith("friction"):
+                check_not_negative(field.name, value)
+            else:
+                check_positive(field.name, value)
+                # Less, and products of them vanish.
+                check_at_least(field.name, value, 1.0 / LARGEST)
+            check_at_most(field.name, value, LARGEST)
 
     @property
     def state_dim(self) -> int:

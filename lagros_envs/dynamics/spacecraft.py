@@ -5,8 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from lagros_envs.checks import check_fields, check_positive
+from lagros_envs.checks import (
+    LARGEST,
+    check_at_least,
+    check_at_most,
+    check_fields,
+    check_positive,
+)
 from lagros_envs.dynamics.system import Components
+from lagros_envs.values import use_plain_numbers
 
 X, Y, HEADING, VELOCITY_X, VELOCITY_Y, SPIN = range(6)
 
@@ -37,8 +44,13 @@ class Spacecraft:
     def __post_init__(self) -> None:
         """Check that the parameters are physical."""
         check_fields(self)
+        use_plain_numbers(self)
         for field in fields(self):
-            check_positive(field.name, getattr(self, field.name))
+            value = getattr(self, field.name)
+            check_positive(field.name, value)
+            # Less, and what is divided by it has no bound.
+            check_at_least(field.name, value, 1.0 / LARGEST)
+            check_at_most(field.name, value, LARGEST)
 
     @property
     def state_dim(self) -> int:

@@ -82,6 +82,7 @@ def replay_cartpole(
         disturbance=given,
         disturbance_bound=given.bound,
         settings=settings,
+        max_episode_steps=settings.steps,
         disable_env_checker=True,
     ).unwrapped
     seed = episodes.seeds[index]
