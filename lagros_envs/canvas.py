@@ -115,16 +115,26 @@ class Canvas:
 
     def close(self) -> None:
         """Close the window, if it is ours."""
-        if self._window is not None and self._pygame.display.get_surface() is self._window:
+        if self._window is not None and self._is_open():
             self._pygame.display.quit()
         self._window = None
+
+    def _is_open(self) -> bool:
+        """Return whether pygame's window is ours, or looks just like it."""
+        display = self._pygame.display
+        surface = display.get_surface()
+        return (
+            surface is not None
+            and surface.get_size() == self._size
+            and display.get_caption()[0] == self._caption
+        )
 
     def _clear(self) -> None:
         """Begin a frame."""
         if not hasattr(self, "_pygame"):
             self._prepare()
         # Someone else may have opened a window, or closed all of pygame.
-        if self._seen and self._pygame.display.get_surface() is not self._window:
+        if self._seen and not self._is_open():
             self._open()
         self._canvas.fill(WHITE)
 

@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
@@ -130,16 +130,18 @@ def _limit_from_make() -> int | None:
 def plain(value: Any) -> Any:
     """Return arguments of an environment in a form that JSON holds, as far as there is one.
 
-    Dataclasses stay: Gymnasium writes them as dictionaries, and environments read those.
+    Settings become the dictionaries that environments read; a function stays.
     """
+    if is_dataclass(value) and not isinstance(value, type) and not callable(value):
+        return plain(asdict(value))
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, AutoresetMode):
         return value.name.lower()
     if isinstance(value, Mapping):
         return {name: plain(item) for name, item in value.items()}
-    if type(value) in (list, tuple):
-        return type(value)(plain(item) for item in value)
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
     return value
 
 
@@ -235,8 +237,8 @@ def built_like(default: Settings, given: Any, name: str) -> Settings:
     for key, value in given.items():
         if key not in known:
             raise ValueError(
-                f"{name} has no entry {shown(key)}{suggestion(key, known)}; it has "
-                f"{', '.join(known)}"
+                f"{name} has no entry {shown(key)}; it has {', '.join(known)}."
+                f"{suggestion(key, known)}"
             )
         usual = getattr(default, key)
         nested = is_dataclass(usual) and not isinstance(usual, type)

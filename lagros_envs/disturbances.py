@@ -235,7 +235,7 @@ class Disturbance(ByValue):
         if not callable(self.kind) and self.kind not in KINDS:
             raise ValueError(
                 f"disturbance={shown(self.kind)} is not known; use one of {', '.join(KINDS)} or a "
-                f"callable{suggestion(self.kind, KINDS)}"
+                f"callable.{suggestion(self.kind, KINDS)}"
             )
         check_not_negative("disturbance_bound", self.bound)
         if not any(self.channels):

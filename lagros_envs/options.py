@@ -37,8 +37,8 @@ def known_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) -> 
     for name in options:
         if name not in known:
             raise ValueError(
-                f"options has no entry {shown(name)}{suggestion(name, known)}; its entries may be "
-                f"{', '.join(known)}"
+                f"options has no entry {shown(name)}; its entries may be {', '.join(known)}."
+                f"{suggestion(name, known)}"
             )
     return dict(options)
 
