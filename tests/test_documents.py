@@ -19,6 +19,7 @@ from tests import documents
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+SOURCES = ("benchmarks", "examples", "lagros_envs", "lagros_policies", "tests")
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 # What the command line raises; typer brings a click of its own.
 USAGE_ERROR = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "UsageError")
@@ -45,6 +46,8 @@ def check_lagros(words):
 def check_python(words):
     """A script or module is there, and the text of its folder knows every option."""
     if words[0] == "-m":
+        for statement in re.findall(r"from lagros\S* import \w+", " ".join(words)):
+            exec(statement, {})
         if words[1] in ("venv", "pytest", "pip", "timeit"):
             return
         spec = importlib.util.find_spec(words[1])
@@ -84,7 +87,7 @@ def check_commands(text):
     for line, (program, *words) in found:
         try:
             CHECKS.get(program.rpartition("/")[2], lambda words: None)(words)
-        except (USAGE_ERROR, AssertionError) as error:
+        except (USAGE_ERROR, AssertionError, ImportError) as error:
             message = getattr(error, "message", None) or error
             pytest.fail(f"line {line}: {' '.join([program, *words])}: {message}")
     return found
@@ -137,6 +140,13 @@ def test_what_a_page_links_to_is_there(page):
     for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
         if "://" not in target:
             assert (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", named([ROOT / "CONTRIBUTING.md", ROOT / "docs/architecture.md"]))
+def test_the_modules_that_a_page_names_are_there(page):
+    places = [path for folder in SOURCES for path in (ROOT / folder).rglob("*.py")]
+    for name in re.findall(r"`([\w./]+\.py)`", page.read_text(encoding="utf-8")):
+        assert any(str(path).endswith(f"/{name}") for path in places), name
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,8 @@ from lagros_envs.scenarios import MOST_AGENTS, PRESETS
 TASKS = ("cartpole", "spacecraft")
 BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
 SPEEDS = {"cartpole": 1.0, "spacecraft": 4.0}
+# Slower films would have pictures without end, faster ones none.
+SLOWEST, FASTEST = 0.05, 1000.0
 # "worst" needs a metric and a plan, which not every policy has.
 WATCHED_KINDS = tuple(kind for kind in KINDS if kind != "worst")
 _USE_VIDEO = "write a file with --video out.gif"
@@ -87,6 +89,10 @@ class WatchSettings:
             check_not_negative("bound", self.bound)
         if self.speed is not None:
             check_positive("speed", self.speed)
+            if not SLOWEST <= self.speed <= FASTEST:
+                raise ValueError(
+                    f"speed={self.speed!r} must be between {SLOWEST:g} and {FASTEST:g}"
+                )
         if self.seconds is not None:
             check_positive("seconds", self.seconds)
         if self.task == "cartpole":

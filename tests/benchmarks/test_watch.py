@@ -369,6 +369,8 @@ def test_where_no_window_opens_the_option_is_named(invoke, monkeypatch):
     [
         (("cartpol",), "Did you mean 'cartpole'?"),
         (("spacecraft", "--video", "x.avi"), "must end in .gif or .mp4"),
+        (("cartpole", "--speed", 0.04), "speed=0.04 must be between 0.05 and 1000"),
+        (("spacecraft", "--speed", 1e9), "speed=1000000000.0 must be between 0.05 and 1000"),
         (("spacecraft", "--preset", "opn"), "Did you mean 'open'?"),
         (("spacecraft", "--agents", "0"), "agents=0 must be a whole number"),
         (("spacecraft", "--bound", "nan"), "bound=nan must be a finite number"),
