@@ -16,6 +16,8 @@ from lagros_benchmarks.reproduction import reproduce
 from lagros_benchmarks.runner import run_benchmark
 from lagros_envs.observation import Layout
 from lagros_policies.imitation.dataset import ExpertDataSettings
+from lagros_policies.imitation.network_policy import PRETRAINED
+from lagros_policies.imitation.networks import Mlp
 from lagros_policies.imitation.spacecraft_flights import FlightData, FlightSettings
 from lagros_policies.imitation.train import TrainingSettings
 from lagros_policies.imitation.train_deep_set import DeepSetTraining
@@ -79,6 +81,9 @@ def test_an_interrupted_run_ends_with_the_files_of_one_that_was_not(tmp_path):
         tmp_path / "whole", tmp_path / "broken", FILES, shallow=False
     )
     assert (sorted(same), different, missing) == (sorted(FILES), [], [])
+
+    shipped = Mlp.load(PRETRAINED / "cartpole_lagros.safetensors").metadata
+    assert Mlp.load(tmp_path / "whole" / "cartpole_lagros.safetensors").metadata == shipped
 
     run = run_benchmark(benchmark)
     assert {case.policy for case in run.episodes} == {"learned", "tube-mpc", "lagros", "lqr"}

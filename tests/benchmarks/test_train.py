@@ -308,6 +308,10 @@ def test_the_record_says_what_the_weights_depend_on(tmp_path):
     assert [row["disturbance"] for row in record["final"]] == ["none", "uniform"]
     actor = Actor.load(tmp_path / "weights.safetensors")
     assert actor.squash == "tanh"
+    assert (actor.metadata["task"], actor.metadata["policy"]) == ("cartpole", "sac")
+    said = json.loads(actor.metadata["trained_for"])
+    assert said["equal"]["control_period"] == 0.1
+    assert said["at_most"]["time_limit"] == 9.0
     figures = cartpole.evaluate(
         ActorPolicy(weights=actor), episode_seeds(0, 6, FINAL), "uniform", 0.75
     )

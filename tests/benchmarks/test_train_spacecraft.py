@@ -380,6 +380,9 @@ def test_an_interrupted_training_ends_with_the_same_weights(tmp_path, monkeypatc
     cut = run(tmp_path / "cut")
     weights = [tmp_path / name / "weights.safetensors" for name in ("cut", "whole")]
     assert weights[0].read_bytes() == weights[1].read_bytes()
+    metadata = Mlp.load(weights[0]).metadata
+    assert (metadata["task"], metadata["policy"]) == ("spacecraft", "ppo")
+    assert json.loads(metadata["trained_for"])["equal"]["horizon"] == 30.0
     for name in ("success", "steps", "effort_to_success"):
         assert cut["curve"][name] == whole["curve"][name]
     assert cut["final"] == whole["final"]

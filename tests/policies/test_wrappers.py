@@ -402,3 +402,10 @@ def test_the_list_names_only_what_there_is():
         assert any(
             hasattr(place, name) for place in (gym, gym.vector, gym.wrappers, vector_wrappers)
         ), name
+
+
+def test_looks_through_the_collector_of_minari():
+    minari = pytest.importorskip("minari")
+    env = minari.DataCollector(gym.make("lagros/CartPole-v0"))
+    assert make("lqr", env).name == "lqr"
+    env.close()
