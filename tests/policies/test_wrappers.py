@@ -406,6 +406,4 @@ def test_the_list_names_only_what_there_is():
 
 def test_looks_through_the_collector_of_minari():
     minari = pytest.importorskip("minari")
-    env = minari.DataCollector(gym.make("lagros/CartPole-v0"))
-    assert make("lqr", env).name == "lqr"
-    env.close()
+    assert what_it_changes(minari.DataCollector) is None
