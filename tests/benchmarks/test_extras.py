@@ -174,6 +174,32 @@ def test_what_needs_another_extra_names_it_before_it_works(project, tmp_path):
     assert list(tmp_path.glob("**/*.*")) == []
 
 
+def test_every_policy_flies_with_its_extra_alone(project):
+    code = f"""{absent(with_extra_alone(project, "policies"))}
+import gymnasium, lagros_envs, lagros_policies, numpy as np
+from lagros_envs import spacecraft_v0
+from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
+
+env = gymnasium.make("lagros/CartPole-v0")
+for name in NAMES:
+    policy, (seen, _), memory = lagros_policies.make(name, env), env.reset(seed=1), None
+    for first in (True, False):
+        action, memory = policy.predict(seen, memory, np.array([first]))
+        seen, *_ = env.step(action)
+world = spacecraft_v0.parallel_env(num_agents=2)
+for name in SPACECRAFT_NAMES:
+    policy, (seen, _) = lagros_policies.make(name, world), world.reset(seed=1)
+    together = getattr(policy, "observes", "local") == "global"
+    seen = world.state()[None] if together else np.stack(list(seen.values()))
+    actions, _ = policy.predict(seen, None, np.ones(len(seen), bool))
+    world.step(dict(zip(world.agents, np.reshape(actions, (2, -1)), strict=True)))
+print(*sorted({{name.partition(".")[0] for name in sys.modules}}))
+"""
+    result = python(code)
+    assert result.returncode == 0, result.stderr
+    assert set(MODULES["policies"]) <= set(result.stdout.split()) | {"clarabel"}
+
+
 def test_every_policy_names_the_extra_that_flies_it(project):
     code = f"""{absent(MODULES["policies"])}
 import gymnasium, lagros_envs, lagros_policies
