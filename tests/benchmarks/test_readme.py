@@ -52,6 +52,18 @@ def test_the_readers_own_policy_has_the_success_that_is_said(
     assert row[1] == "100.0"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "said"), [(1, "6 of 6 arrived, 0 collided"), (0, "2 collided")])
+def test_the_worlds_to_watch_are_what_is_said_of_them(
+    seed: int, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    command = ["watch", "spacecraft", "--seed", str(seed), "--speed", "100", "--video", "x.gif"]
+    result = CliRunner().invoke(cli.app, command)
+    assert result.exit_code == 0
+    assert said in result.output
+
+
 def test_the_first_half_needs_no_other_extra_than_that_of_the_command_line() -> None:
     blocks, typed = first_half.blocks_and_commands(TEXT)
     assert len(blocks) == 4
