@@ -270,7 +270,8 @@ def _unmet(value: object, hint: Any) -> str:
     if hint is float:
         return "" if is_finite(value) else "a finite number"
     if hint is int:
-        return "" if is_whole(value) else "a whole number"
+        fits = is_whole(value) and abs(value) < MOST_SEEDS
+        return "" if fits else "a whole number below 2**128"
     if hint is bool:
         return "" if isinstance(value, bool) else "True or False"
     if hint is types.NoneType:
