@@ -151,8 +151,14 @@ def _train_one(
     command += "" if segments is None else f" --segments {segments}"
     command += "" if residual is None else f" --residual {residual:g}"
     record = train_run(run, place, lambda: lesson_of(run, parallel_env), command)
+    try:
+        table = final_table(record)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{place.record} is damaged ({type(error).__name__}: {error}); delete {place.folder}"
+        ) from error
     typer.echo(f"{place.weights}, on held-out episodes:")
-    Console(highlight=False).print(final_table(record))
+    Console(highlight=False).print(table)
     return record
 
 

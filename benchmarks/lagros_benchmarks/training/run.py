@@ -31,10 +31,13 @@ from lagros_benchmarks.surroundings import machine, versions
 from lagros_benchmarks.training.agent import make_agent
 from lagros_benchmarks.training.curves import AXES
 from lagros_benchmarks.training.settings import Training
+from lagros_envs.checks import is_finite
+from lagros_envs.reading import Record, check_file
 from lagros_policies.imitation.networks import read_safetensors
 
 _LOG = logging.getLogger(__name__)
 WEIGHTS, RECORD, CHECKPOINT = "weights.safetensors", "record.json", "checkpoint.pt"
+_LONGEST = 300  # letters of what torch says of a file
 _BUFFERED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
@@ -147,12 +150,18 @@ def train(
 
 def _complete(place: Place, settings: Any) -> dict[str, Any] | None:
     """Return the record of a run whose weights are whole, None if they are not."""
+    damaged = f"delete {place.folder}"
     try:
-        record: dict[str, Any] = json.loads(place.record.read_text())
-        stored = record["training"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{place.record} is damaged ({error}); delete {place.folder}") from error
+        found = Record.load(place.record, "the record of a run")
+        stored = found.record("training").entries
+    except ValueError as error:
+        raise ValueError(f"{error}; {damaged}") from error
     _check_same(place.folder, stored, settings)
+    try:
+        _check_figures(found, settings["segments"])
+    except ValueError as error:
+        raise ValueError(f"{error}; {damaged}") from error
+    record = dict(found.entries)
     try:
         read_safetensors(place.weights)
         # Records of earlier versions have no hash; the file itself has a checksum.
@@ -162,6 +171,22 @@ def _complete(place: Place, settings: Any) -> dict[str, Any] | None:
         _LOG.warning("%s; the run is made again", error)
         return None
     return record
+
+
+def _check_figures(found: Record, segments: int) -> None:
+    """Check that a record has a learning curve and figures at its end.
+
+    Raises:
+        ValueError: It does not.
+    """
+    curve = found.record("curve")
+    for axis in AXES:
+        curve.array(axis, (segments,))
+    for name in curve.entries:
+        if len(curve.list(name)) != segments:
+            raise ValueError(f"{curve.name}: {name!r} must have one number for each segment")
+    for index, figures in enumerate(found.list("final")):
+        Record(figures, f"{found.name}: 'final' {index}")
 
 
 def _digest(path: Path) -> str:
@@ -288,23 +313,35 @@ def _save(path: Path, settings: Any, model: BaseAlgorithm, curve: list[dict[str,
 
 
 def _restore(path: Path, settings: Any, model: BaseAlgorithm) -> list[dict[str, float]]:
+    check_file(path)
     try:
         content = torch.load(path, weights_only=True)  # tensors and plain values: no pickled code
         stored = json.loads(content["training"])
     except Exception as error:
-        raise ValueError(f"the checkpoint {path} is damaged ({error}); delete it") from error
+        raise _damaged(path, error) from error
     _check_same(path.parent, stored, settings)
-    model.set_parameters(content["parameters"])
-    for name, value in _variables(model).items():
-        value.data.copy_(content["variables"][name])
-    for name, rms in _statistics(model).items():
-        mean, var, count = content["statistics"][name]
-        rms.mean, rms.var, rms.count = mean.numpy(), var.numpy(), float(count)
-    _refill(model, content["buffer"])
-    model.num_timesteps = content["timesteps"]
-    model._n_updates = content["updates"]
-    curve: list[dict[str, float]] = content["curve"]
+    try:
+        model.set_parameters(content["parameters"])
+        for name, value in _variables(model).items():
+            value.data.copy_(content["variables"][name])
+        for name, rms in _statistics(model).items():
+            mean, var, count = content["statistics"][name]
+            rms.mean, rms.var, rms.count = mean.numpy(), var.numpy(), float(count)
+        _refill(model, content["buffer"])
+        model.num_timesteps = int(content["timesteps"])
+        model._n_updates = int(content["updates"])
+        curve: list[dict[str, float]] = [dict(point) for point in content["curve"]]
+        if not all(is_finite(point[axis]) for point in curve for axis in AXES):
+            raise ValueError("its learning curve holds what is no number")
+    except Exception as error:
+        # Torch and stable-baselines3 each raise their own for what does not fit.
+        raise _damaged(path, error) from error
     return curve
+
+
+def _damaged(path: Path, error: Exception) -> ValueError:
+    reason = " ".join(f"{type(error).__name__}: {error}".split())[:_LONGEST]
+    return ValueError(f"the checkpoint {path} is damaged ({reason}); delete it")
 
 
 def _variables(model: BaseAlgorithm) -> dict[str, torch.Tensor]:
