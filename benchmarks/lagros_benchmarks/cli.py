@@ -279,7 +279,7 @@ def reproduce(
                 else run_reproduction(place, wanted, progress, progress_line)
             )
     except ValueError as error:
-        fail(error)
+        fail(str(error).replace("worlds=", "--episodes="))
     except (ImportError, BackendError) as error:
         fail(error, status=1)
     run_and_report(benchmark, outputs, place / "benchmark", keep=True)

@@ -290,10 +290,10 @@ def test_the_folder_of_another_run_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"seed is 1 there and 0 here\); delete it"):
         run(TINY, folder)
     (folder / "record.json").write_text('{"training": []}')
-    with pytest.raises(ValueError, match="holds another run"):
+    with pytest.raises(ValueError, match=r"record\.json: 'training' must be an object"):
         run(TINY, folder)
     (folder / "record.json").write_text("{")
-    with pytest.raises(ValueError, match="is damaged"):
+    with pytest.raises(ValueError, match=r"record\.json is not the record of a run"):
         run(TINY, folder)
 
 
