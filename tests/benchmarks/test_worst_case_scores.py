@@ -22,6 +22,7 @@ from lagros_benchmarks.worst_case.replay import Outcome, replay_cartpole, replay
 from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_benchmarks.worst_case.seeds import ATTACK, CALIBRATION
 from lagros_benchmarks.worst_case.spacecraft import SpacecraftFlights, SpacecraftTarget
+from lagros_envs.conventions import beyond_the_end
 from lagros_envs.seeding import EVALUATION, episode_seeds
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
 from lagros_policies.baselines import LqrPolicy
@@ -244,7 +245,8 @@ def test_a_flight_is_measured_as_the_world_is_seen(bound: float) -> None:
     hit = np.zeros(2, bool)
     for step in range(env.settings.steps):
         action, memory = policy.predict(env.state(), memory)
-        info = env.step(action.reshape(2, -1))[4]
+        with beyond_the_end():
+            info = env.step(action.reshape(2, -1))[4]
         place = env.states[0, :, :2]
         # In the preset "open" there is nothing but the two.
         gaps.append(np.hypot(*(place[0] - place[1])) - 2.0 * env.scenarios[0].agent_radius)
