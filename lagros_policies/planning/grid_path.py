@@ -4,6 +4,10 @@ Guesses need not obey any constraint. They choose the side on which an agent pas
 another agent, which the quadratic programs that follow cannot change. Every choice is
 deterministic; ties go to the side that leaves the obstacle on the left and to agents that keep to
 the right.
+
+However far starts, goals and obstacles lie apart, no more cells are looked at than `GridSettings`
+says: where one grid for all would have more, each agent has one of its own, as coarse as it must
+be.
 """
 
 from __future__ import annotations
@@ -16,10 +20,15 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
-from lagros_envs.checks import check_fields, check_not_negative, check_positive
+from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+
+# Cells that every agent has at least, however many agents there are.
+_FEWEST = 400
+# Far beyond any arena, and far below where differences of positions lose the obstacles [m].
+_FARTHEST = 1e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +43,8 @@ class GridSettings:
         sidestep: How far to the right of its path an agent is guessed at its middle [m].
         search_cell: Cell of the search in space and time [m].
         search_period: Its time step [s].
+        most_cells: Cells of the shortest paths; 100,000 take half a second, or 45 m by 50 m.
+        most_search_cells: Cells of the search, of each of its layers.
 
     Raises:
         ValueError: A value is out of range.
@@ -46,6 +57,8 @@ class GridSettings:
     sidestep: float = 0.4
     search_cell: float = 0.25
     search_period: float = 1.0
+    most_cells: int = 100_000
+    most_search_cells: int = 40_000
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -54,6 +67,8 @@ class GridSettings:
             check_not_negative(item.name, getattr(self, item.name))
         for name in ("cell", "search_cell", "search_period"):
             check_positive(name, getattr(self, name))
+        for name in ("most_cells", "most_search_cells"):
+            check_whole(name, getattr(self, name), _FEWEST)
         if self.preference >= 1.0:
             raise ValueError(f"preference={self.preference!r} must be below 1")
 
@@ -79,21 +94,25 @@ def shortest_paths(
     Returns:
         One polyline per agent, shape (points, 2), from its start to its goal [m].
     """
-    origin, shape = _frame(starts, goals, obstacles, settings.cell, settings.border)
-    graph = _graph(origin, shape, obstacles, distance, settings)
-    sources = _nearest_cell(starts, origin, shape, settings.cell)
-    targets = _nearest_cell(goals, origin, shape, settings.cell)
-    _, before = dijkstra(graph, indices=sources, return_predecessors=True)
-    paths = []
-    for agent in range(len(starts)):
-        chain = [int(targets[agent])]
-        while before[agent, chain[-1]] >= 0:
-            chain.append(int(before[agent, chain[-1]]))
-        cells = np.stack(np.unravel_index(np.array(chain[::-1]), shape), axis=-1)
-        inner = origin + settings.cell * cells[1:-1]
-        path = np.vstack([starts[agent], inner, goals[agent]])
-        paths.append(straighten(path, obstacles, distance))
-    return paths
+    frames = _frames(starts, goals, obstacles, settings.cell, settings.border, settings.most_cells)
+    # One graph where all share it: the agents of a frame, in their order.
+    sharing: dict[_Frame, list[int]] = {}
+    for agent, frame in enumerate(frames):
+        sharing.setdefault(frame, []).append(agent)
+    paths: dict[int, FloatArray] = {}
+    for frame, agents in sharing.items():
+        graph = _graph(frame, obstacles, distance, settings)
+        sources, targets = frame.nearest(starts[agents]), frame.nearest(goals[agents])
+        _, before = dijkstra(graph, indices=sources, return_predecessors=True)
+        for row, agent in enumerate(agents):
+            chain = [int(targets[row])]
+            while before[row, chain[-1]] >= 0:
+                chain.append(int(before[row, chain[-1]]))
+            cells = np.stack(np.unravel_index(np.array(chain[::-1]), frame.shape), axis=-1)
+            inner = frame.origin + frame.cell * cells[1:-1]
+            path = np.vstack([starts[agent], inner, goals[agent]])
+            paths[agent] = straighten(path, obstacles, distance)
+    return [paths[agent] for agent in range(len(starts))]
 
 
 def straighten(path: FloatArray, obstacles: FloatArray, distance: FloatArray) -> FloatArray:
@@ -200,24 +219,28 @@ def search_in_turn(
     Returns:
         Positions, shape (n, k, 2) [m].
     """
-    cell, duration = settings.search_cell, float(times[-1])
-    origin, shape = _frame(starts, goals, obstacles, cell, settings.border)
+    duration = float(times[-1])
+    most = settings.most_search_cells
+    frames = _frames(starts, goals, obstacles, settings.search_cell, settings.border, most)
     layers = max(2, round(duration / settings.search_period))
-    centres = _centres(origin, shape, cell)
-    gaps = np.linalg.norm(centres[:, :, None] - obstacles, axis=-1) - distance
-    # Half a cell of leave: the programs that follow polish the guess.
-    static = _price(np.min(gaps, axis=-1, initial=np.inf) + 0.5 * cell)
-    sources = _nearest_cell(starts, origin, shape, cell)
-    targets = _nearest_cell(goals, origin, shape, cell)
     instants = np.linspace(0.0, duration, layers + 1)
     found = np.zeros((len(starts), layers + 1, 2))
+    standing: dict[_Frame, FloatArray] = {}
     for turn, agent in enumerate(order):
-        prices = np.repeat(static[None], layers + 1, axis=0)
+        frame = frames[agent]
+        centres = frame.centres()
+        if frame not in standing:
+            gaps = np.linalg.norm(centres[:, :, None] - obstacles, axis=-1) - distance
+            # Half a cell of leave: the programs that follow polish the guess.
+            least = np.min(gaps, axis=-1, initial=np.inf)
+            standing[frame] = _price(least + 0.5 * frame.cell)
+        prices = np.repeat(standing[frame][None], layers + 1, axis=0)
         for other in order[:turn]:
             apart = np.linalg.norm(centres - found[other][:, None, None], axis=-1)
             prices += _price(apart - pair_distance)
-        cells = _cheapest_chain(prices, int(sources[agent]), int(targets[agent]))
-        found[agent] = origin + cell * cells
+        source, target = frame.nearest(np.stack([starts[agent], goals[agent]]))
+        cells = _cheapest_chain(prices, int(source), int(target))
+        found[agent] = frame.origin + frame.cell * cells
         found[agent, 0], found[agent, -1] = starts[agent], goals[agent]
     return np.stack(
         [
@@ -264,45 +287,92 @@ def _cheapest_chain(prices: FloatArray, source: int, target: int) -> IntArray:
     return np.array(chain[::-1])
 
 
-def _frame(
-    starts: FloatArray, goals: FloatArray, obstacles: FloatArray, cell: float, border: float
-) -> tuple[FloatArray, tuple[int, int]]:
-    points = np.vstack([starts, goals, obstacles])
-    low, high = points.min(axis=0) - border, points.max(axis=0) + border
-    count = np.ceil((high - low) / cell).astype(int) + 1
-    return low, (int(count[0]), int(count[1]))
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """Where a grid lies.
+
+    Attributes:
+        origin: Its lowest corner, shape (2,) [m].
+        shape: Rows and columns.
+        cell: Side of a cell [m].
+    """
+
+    origin: FloatArray
+    shape: tuple[int, int]
+    cell: float
+
+    @classmethod
+    def around(cls, points: FloatArray, cell: float, border: float, most: int) -> _Frame:
+        """Return a grid around points (p, 2), with larger cells where there would be too many."""
+        low, high = points.min(axis=0) - border, points.max(axis=0) + border
+        sides = high - low
+        if not np.max(np.abs(points)) < _FARTHEST:
+            raise ValueError(
+                f"positions of up to {float(np.max(np.abs(points))):.3g} m must be below "
+                f"{_FARTHEST:g} m: give them from an origin that is nearer"
+            )
+        cell = max(cell, math.sqrt(sides[0] * sides[1] / most))
+        cells = np.ceil(sides / cell) + 1.0
+        while cells[0] * cells[1] > most:
+            cell *= 1.05
+            cells = np.ceil(sides / cell) + 1.0
+        return cls(low, (int(cells[0]), int(cells[1])), cell)
+
+    def centres(self) -> FloatArray:
+        """Return the points of the grid, shape (rows, columns, 2)."""
+        first, second = (
+            self.origin[axis] + self.cell * np.arange(self.shape[axis]) for axis in range(2)
+        )
+        return np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1)
+
+    def nearest(self, points: FloatArray) -> IntArray:
+        """Return the flat index of the cell nearest to each of the points (p, 2)."""
+        index = np.rint((points - self.origin) / self.cell).astype(np.intp)
+        flat: IntArray = np.ravel_multi_index((index[:, 0], index[:, 1]), self.shape)
+        return flat
 
 
-def _centres(origin: FloatArray, shape: tuple[int, int], cell: float) -> FloatArray:
-    """Return the points of the grid, shape (rows, columns, 2)."""
-    first, second = (origin[axis] + cell * np.arange(shape[axis]) for axis in range(2))
-    return np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1)
+def _frames(
+    starts: FloatArray,
+    goals: FloatArray,
+    obstacles: FloatArray,
+    cell: float,
+    border: float,
+    most: int,
+) -> list[_Frame]:
+    """Return the grid of each agent: one for all, or one of its own where that would be too large.
 
-
-def _nearest_cell(
-    points: FloatArray, origin: FloatArray, shape: tuple[int, int], cell: float
-) -> IntArray:
-    index = np.rint((points - origin) / cell).astype(np.intp)
-    flat: IntArray = np.ravel_multi_index((index[:, 0], index[:, 1]), shape)
-    return flat
+    An agent's own reaches from its start to its goal and around the obstacles there; all of them
+    together have no more than `most` cells.
+    """
+    whole = _Frame.around(np.vstack([starts, goals, obstacles]), cell, border, most)
+    if whole.cell == cell:
+        return [whole] * len(starts)
+    frames = []
+    for ends in np.stack([starts, goals], axis=1):
+        low, high = ends.min(axis=0) - border, ends.max(axis=0) + border
+        near = obstacles[np.all((obstacles >= low) & (obstacles <= high), axis=1)]
+        share = max(most // len(starts), _FEWEST)
+        frames.append(_Frame.around(np.vstack([ends, near]), cell, border, share))
+    return frames
 
 
 def _graph(
-    origin: FloatArray,
-    shape: tuple[int, int],
+    frame: _Frame,
     obstacles: FloatArray,
     distance: FloatArray,
     settings: GridSettings,
 ) -> sparse.csr_matrix:
     """Return the directed lengths between each cell and its sixteen nearest in sight."""
+    shape = frame.shape
     count = shape[0] * shape[1]
     number = np.arange(count).reshape(shape)
-    centres = _centres(origin, shape, settings.cell)
+    centres = frame.centres()
     rows, columns, lengths = [], [], []
     for i, j in (s for s in _STEPS if math.gcd(*s) == 1):
         here = (_overlap(i, shape[0]), _overlap(j, shape[1]))
         there = (_overlap(-i, shape[0]), _overlap(-j, shape[1]))
-        step = settings.cell * np.array([i, j], dtype=np.float64)
+        step = frame.cell * np.array([i, j], dtype=np.float64)
         length = float(np.linalg.norm(step))
         offset = centres[here] + 0.5 * step
         delta = offset[..., None, :] - obstacles

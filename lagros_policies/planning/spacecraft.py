@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,9 +176,11 @@ class SpacecraftPlanner:
         solved: list[JointPlan] = []
         closest: tuple[float, JointPlan] | None = None
         iterations = attempts = 0
-        for margin in settings.margins:
+        # A goal that is too far for the speed: one program shows how near it comes.
+        few = 1 if self._beyond_reach(scene) else None
+        for margin in settings.margins[:few]:
             problem = self._problem(scene, nodes, margin)
-            for name, guess in self._guesses(scene, problem, margin):
+            for name, guess in islice(self._guesses(scene, problem, margin), few):
                 solution = solve_joint(problem, guess, settings.scp)
                 iterations += solution.iterations
                 attempts += 1
@@ -195,6 +198,9 @@ class SpacecraftPlanner:
         else:
             assert closest is not None  # the first guess always exists
             chosen = closest[1]
+            if few is not None:
+                far = f"a goal is out of reach at speed_limit={settings.speed_limit:g} m/s"
+                chosen = replace(chosen, status=f"{chosen.status}; {far}")
         seconds = time.perf_counter() - begun
         return replace(chosen, iterations=iterations, attempts=attempts, seconds=seconds)
 
@@ -211,6 +217,15 @@ class SpacecraftPlanner:
                 f"{settings.node_period} s"
             )
         return nodes.astype(np.intp)
+
+    def _beyond_reach(self, scene: _Scene) -> bool:
+        """Return whether an agent cannot come to its goal in its time at the largest speed."""
+        if scene.start_cost is not None:
+            return False  # plans may begin elsewhere
+        speed = np.maximum(self.settings.speed_limit, np.abs(scene.starts[:, 2:]))
+        reach = speed * (self.settings.node_period * scene.arrivals)[:, None]
+        way = np.abs(scene.goals[:, :2] - scene.starts[:, :2])
+        return bool(np.any(way > reach * (1.0 + 1e-9)))
 
     def _problem(self, scene: _Scene, nodes: int, margin: float) -> JointProblem:
         settings = self.settings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lagros_envs.dynamics.spacecraft import Spacecraft
-from lagros_policies.planning import joint_scp
+from lagros_policies.planning import grid_path, joint_scp
 from lagros_policies.planning.grid_path import (
     GridSettings,
     search_in_turn,
@@ -382,6 +382,76 @@ def test_search_in_turn_lets_the_later_agent_give_way():
         assert np.max(np.abs(guess[order[0], :, 1])) < 0.25
 
 
+@pytest.mark.parametrize("far", [60.0, 300.0, 1e6])
+def test_no_more_cells_are_looked_at_however_far_things_are(monkeypatch, far):
+    counts = []
+    search, chain = grid_path.dijkstra, grid_path._cheapest_chain
+    monkeypatch.setattr(
+        grid_path,
+        "dijkstra",
+        lambda graph, **options: (counts.append(graph.shape[0]), search(graph, **options))[1],
+    )
+    monkeypatch.setattr(
+        grid_path,
+        "_cheapest_chain",
+        lambda prices, *ends: (counts.append(prices[0].size), chain(prices, *ends))[1],
+    )
+    settings = GridSettings(most_cells=20_000, most_search_cells=5_000)
+    starts = np.array([[0.0, 0.0], [far, far], [0.0, 1.0]])
+    goals = np.array([[4.0, 0.0], [far + 4.0, far], [far, 0.2 * far]])
+    obstacles, radius = np.array([[2.0, 0.0], [0.5 * far, 0.1 * far]]), np.array([1.0, 1.0])
+    paths = shortest_paths(starts, goals, obstacles, radius, settings)
+    assert sum(counts) <= 20_000
+    counts.clear()
+    times, order = np.linspace(0.0, 30.0, 31), np.arange(3)
+    guess = search_in_turn(starts, goals, obstacles, radius, 0.8, times, order, settings)
+    assert sum(counts) <= 5_000
+    for agent in range(3):
+        for way in (paths[agent], guess[agent]):
+            assert np.array_equal(way[[0, -1]], np.stack([starts[agent], goals[agent]]))
+    # Near by, each has a grid as fine as ever: the first goes around, the second straight on.
+    assert np.min(segment_distance(paths[0][:-1], paths[0][1:], obstacles[:1])) > 0.99
+    assert len(paths[1]) == 2
+
+
+def test_a_grid_that_is_small_enough_is_what_it_was():
+    starts, goals, obstacles = scenario(0)
+    radius = np.full(len(obstacles), 0.9)
+    every = [
+        shortest_paths(starts, goals, obstacles, radius, GridSettings(most_cells=most))
+        for most in (100_000, 10**9)
+    ]
+    for one, other in zip(*every, strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_positions_beyond_all_sense_are_named():
+    ends = np.array([[0.0, 0.0]]), np.array([[1e300, 0.0]])
+    with pytest.raises(ValueError, match=r"1e\+300 m must be below"):
+        shortest_paths(*ends, NONE, np.empty(0), GridSettings())
+
+
+@pytest.mark.parametrize("far", [25.0, 1e3])
+def test_a_goal_out_of_reach_is_a_failed_plan_after_one_program(far):
+    starts = np.array([[0.0, 0.0], [1.5, 0.0]])
+    goals = starts + np.array([far, 0.0])
+    plan = SpacecraftPlanner().plan(starts, goals, np.array([[3.0, 0.1]]), OBSTACLE, AGENT)
+    assert not plan.solved
+    assert plan.attempts == 1
+    assert "out of reach at speed_limit=0.7 m/s" in plan.status
+    assert np.all(np.isfinite(plan.states))
+
+
+def test_agents_far_apart_are_planned_each_in_its_own_place():
+    starts = np.array([[0.0, 0.0], [400.0, 300.0]])
+    plan = SpacecraftPlanner().plan(
+        starts, starts + np.array([5.0, 0.0]), np.array([[2.5, 0.0]]), OBSTACLE, AGENT
+    )
+    assert plan.solved
+    assert plan.attempts == 1
+    assert true_clearance(plan, np.array([[2.5, 0.0]])) > 0.0
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -422,6 +492,8 @@ def test_wrong_arguments_are_named(change, message):
         (GridSettings(), {"cell": 0.0}),
         (GridSettings(), {"preference": 1.0}),
         (GridSettings(), {"border": -1.0}),
+        (GridSettings(), {"most_cells": 1}),
+        (GridSettings(), {"most_search_cells": 1e5}),
     ],
 )
 def test_settings_are_checked(settings, change):
