@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+# Cells times discs, each of which is looked at: a second, and a gigabyte.
+_MOST_CELLS = 50_000_000
+
 
 def way_exists(
     starts: FloatArray, goals: FloatArray, centres: FloatArray, radii: FloatArray, cell: float
@@ -28,6 +31,9 @@ def way_exists(
 
     Returns:
         True if each start has a way to its own goal.
+
+    Raises:
+        ValueError: The grid would have too many cells.
     """
     ends = np.concatenate([starts, goals])
     if _all_free(ends, centres, radii):
@@ -36,6 +42,12 @@ def way_exists(
     low = np.min(np.concatenate([ends, centres - reach]), axis=0) - 2.0 * cell
     high = np.max(np.concatenate([ends, centres + reach]), axis=0) + 2.0 * cell
     columns, rows = (math.ceil(side / cell) + 1 for side in high - low)
+    if columns * rows * len(radii) > _MOST_CELLS:
+        raise ValueError(
+            f"{len(radii)} overlapping obstacles over {high[0] - low[0]:.4g} m by "
+            f"{high[1] - low[1]:.4g} m are too much to look for a way around on cells of {cell:g} "
+            "m: use a smaller arena, fewer or smaller obstacles, or open passages between them"
+        )
     x = low[0] + cell * np.arange(columns)
     y = low[1] + cell * np.arange(rows)
     squares = (x - centres[:, :1])[:, :, None] ** 2 + (y - centres[:, 1:])[:, None, :] ** 2

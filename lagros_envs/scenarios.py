@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from lagros_envs.checks import (
 )
 from lagros_envs.conventions import built_like
 from lagros_envs.files import write_atomic
+from lagros_envs.placement import clear, most_apart, scatter, scatter_pairs
 from lagros_envs.reachable import way_exists
 from lagros_envs.reading import Record
 from lagros_envs.values import ByValue, use_plain_numbers
@@ -32,8 +33,6 @@ BoolArray = NDArray[np.bool_]
 
 FORMAT = "lagros-scenario-1"
 ATTEMPTS = 1000  # of a whole scenario, before the density is called impossible
-DRAWS = 16  # of one obstacle, start or goal at a time ...
-ROUNDS = 12  # ... and how often, before the attempt is given up
 MOST_AGENTS, MOST_OBSTACLES = 1000, 10_000  # all pairs of them are looked at
 GRID = 0.15  # cell of the grid on which a way is looked for [m]
 
@@ -274,16 +273,41 @@ class Preset:
             ValueError: No attempt met the density that is asked for.
         """
         preset = self.for_agents(num_agents)
+        preset._check_room()
         for _ in range(ATTEMPTS):
             scenario = _attempt(preset, rng)
             if scenario is not None:
                 return scenario
-        raise ValueError(
-            f"no scenario with {preset.agents} agents and {preset.obstacle_count[0]} to "
-            f"{preset.obstacle_count[1]} obstacles in an arena of {preset.arena:g} m in {ATTEMPTS} "
-            f"attempts: use fewer agents or obstacles, a larger arena, or a smaller margin "
-            f"({preset.margin:g} m) or least_way ({preset.least_way:g} m)"
+        raise preset._refusal(f"in {ATTEMPTS} attempts")
+
+    def _refusal(self, why: str) -> ValueError:
+        fewest, most = self.obstacle_count
+        return ValueError(
+            f"no scenario with {self.agents} agents and {fewest} to {most} obstacles in an arena "
+            f"of {self.arena:g} m {why}: use fewer agents or obstacles, a larger arena, or a "
+            f"smaller margin ({self.margin:g} m) or least_way ({self.least_way:g} m)"
         )
+
+    def _check_room(self) -> None:
+        """Refuse at once what no draw can give: more than fits, or a longer way than there is.
+
+        Raises:
+            ValueError: The arena cannot hold it.
+        """
+        fewest = self.obstacle_count[0]
+        passage = self.core + self.margin if self.open_passages else 0.0
+        gap = 2.0 * (self.obstacle_radius + passage)
+        room = most_apart(self.arena, gap)
+        if fewest > room:
+            raise self._refusal(f"({gap:g} m apart no more than {room} obstacles fit)")
+        if self.layout == "antipodal":
+            return  # the circle is as wide as it must be
+        apart = 2.0 * (self.agent_radius + self.margin)
+        room = most_apart(self.arena, apart)
+        if self.agents > room:
+            raise self._refusal(f"({apart:g} m apart no more than {room} agents fit)")
+        if self.least_way > math.sqrt(2.0) * self.arena * (1.0 + 1e-12):
+            raise self._refusal("(least_way is longer than the diagonal)")
 
 
 PRESETS: dict[str, Preset] = {
@@ -326,16 +350,24 @@ def _attempt(preset: Preset, rng: np.random.Generator) -> Scenario | None:
     count = int(rng.integers(fewest, most, endpoint=True))
     passage = preset.core + preset.margin if preset.open_passages else 0.0
     gap = 2.0 * (preset.obstacle_radius + passage)
-    obstacles = _scatter(rng, preset.arena, count, gap)
+    obstacles = scatter(rng, preset.arena, count, gap)
     if obstacles is None:
         return None
     clearance = preset.obstacle_radius + preset.core + preset.margin
     if preset.layout == "antipodal":
         ends = _opposite_ends(preset, rng)
-        if not all(np.all(_clear(points, obstacles, clearance)) for points in ends):
+        if not all(np.all(clear(points, obstacles, clearance)) for points in ends):
             return None
     else:
-        found = _random_ends(preset, rng, obstacles, clearance)
+        found = scatter_pairs(
+            rng,
+            preset.arena,
+            preset.agents,
+            2.0 * (preset.agent_radius + preset.margin),
+            preset.least_way,
+            obstacles,
+            clearance,
+        )
         if found is None:
             return None
         ends = found
@@ -350,41 +382,6 @@ def _attempt(preset: Preset, rng: np.random.Generator) -> Scenario | None:
     )
 
 
-def _scatter(rng: np.random.Generator, arena: float, count: int, apart: float) -> FloatArray | None:
-    """Place points one by one, `apart` from each other."""
-    placed = np.empty((count, 2))
-    for index in range(count):
-        for _ in range(ROUNDS):
-            draws = rng.uniform(0.0, arena, (DRAWS, 2))
-            fits = _clear(draws, placed[:index], apart)
-            if fits.any():
-                placed[index] = draws[np.argmax(fits)]
-                break
-        else:
-            return None
-    return placed
-
-
-def _random_ends(
-    preset: Preset, rng: np.random.Generator, obstacles: FloatArray, clearance: float
-) -> tuple[FloatArray, FloatArray] | None:
-    apart = 2.0 * (preset.agent_radius + preset.margin)
-    starts = np.empty((preset.agents, 2))
-    goals = np.empty((preset.agents, 2))
-    for agent in range(preset.agents):
-        for _ in range(ROUNDS):
-            draws = rng.uniform(0.0, preset.arena, (2, DRAWS, 2))
-            fits = np.sum((draws[0] - draws[1]) ** 2, axis=-1) >= preset.least_way**2
-            for ends, points in zip((starts, goals), draws, strict=True):
-                fits &= _clear(points, obstacles, clearance) & _clear(points, ends[:agent], apart)
-            if fits.any():
-                starts[agent], goals[agent] = draws[:, np.argmax(fits)]
-                break
-        else:
-            return None
-    return starts, goals
-
-
 def _opposite_ends(preset: Preset, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Place the agents on a circle in the middle of the arena, wide enough for all of them."""
     apart = 2.0 * (preset.agent_radius + preset.margin)
@@ -394,9 +391,3 @@ def _opposite_ends(preset: Preset, rng: np.random.Generator) -> tuple[FloatArray
     arms = radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     middle = np.full(2, 0.5 * preset.arena)
     return middle + arms, middle - arms
-
-
-def _clear(points: FloatArray, others: FloatArray, distance: float) -> BoolArray:
-    """Tell which points (p, 2) keep the distance to all the others (q, 2)."""
-    squares = np.sum((points[:, None] - others) ** 2, axis=-1)
-    return cast(BoolArray, np.all(squares >= distance**2, axis=1))

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lagros_envs.placement import most_apart
 from lagros_envs.reachable import flood, way_exists
 from lagros_envs.scenarios import PRESETS, Preset, Scenario, preset_named
 from lagros_envs.seeding import episode_streams
@@ -261,3 +262,88 @@ def test_a_scenario_keeps_its_own_read_only_copies():
     assert made.starts[1, 0] == 1.0
     with pytest.raises(ValueError, match="read-only"):
         made.starts[0, 0] = 5.0
+
+
+# Drawing is quick, and what cannot be is refused at once.
+
+
+def by_the_book(rng, preset, count):
+    """Return obstacles, starts and goals as the first accepted draws, looked for one by one."""
+
+    def clear(point, others, distance):
+        squares = [(point[0] - x) ** 2 + (point[1] - y) ** 2 for x, y in others]
+        return all(square >= distance**2 for square in squares)
+
+    room = preset.core + preset.margin
+    gap = 2.0 * (preset.obstacle_radius + room)
+    apart = 2.0 * (preset.agent_radius + preset.margin)
+    obstacles, starts, goals = [], [], []
+    while len(obstacles) < count:
+        draws = rng.uniform(0.0, preset.arena, (16, 2))
+        obstacles += [draw for draw in draws if clear(draw, obstacles, gap)][:1]
+    clearance = preset.obstacle_radius + room
+    while len(starts) < preset.agents:
+        for start, goal in zip(*rng.uniform(0.0, preset.arena, (2, 16, 2)), strict=True):
+            ends = ((start, starts), (goal, goals))
+            fits = all(
+                clear(end, obstacles, clearance) and clear(end, placed, apart)
+                for end, placed in ends
+            )
+            if fits and np.sum((start - goal) ** 2) >= preset.least_way**2:
+                starts.append(start)
+                goals.append(goal)
+                break
+    return np.array(obstacles), np.array(starts), np.array(goals)
+
+
+@pytest.mark.parametrize("agents", [1, 6, 12])
+def test_the_first_draw_that_fits_is_taken_to_the_bit(agents):
+    preset = dataclasses.replace(PRESETS["paper"], agents=agents, obstacle_count=(3, 3))
+    agreed = 0
+    for seed in range(12):
+        found = preset.sample(np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        assert rng.integers(3, 3, endpoint=True) == 3
+        obstacles, starts, goals = by_the_book(rng, preset, 3)
+        # A scenario that took a second attempt began anew in between.
+        if np.array_equal(found.obstacles, obstacles) and np.array_equal(found.starts, starts):
+            assert np.array_equal(found.goals, goals)
+            agreed += 1
+    assert agreed >= 8
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"agents": 60}, "no more than .* agents fit"),
+        ({"agents": 1000, "arena": 1.8}, "no more than .* agents fit"),
+        ({"obstacle_count": (40, 60)}, "no more than .* obstacles fit"),
+        ({"least_way": 7.1}, "longer than the diagonal"),
+        ({"margin": 1e8}, "no more than"),
+        ({"agent_radius": 1e200}, "no more than"),
+    ],
+)
+def test_what_the_arena_cannot_hold_is_refused_before_the_first_draw(change, message):
+    preset = dataclasses.replace(PRESETS["paper"], **change)
+    rng = np.random.default_rng(0)
+    before = rng.bit_generator.state
+    with pytest.raises(ValueError, match=message):
+        preset.sample(rng)
+    assert rng.bit_generator.state == before
+
+
+def test_the_bound_of_points_apart_refuses_none_that_fit():
+    for side in range(1, 9):
+        # A square lattice and a hexagonal one, which is the densest there is.
+        assert most_apart(side - 1.0, 1.0) >= side**2
+        rows = 1 + int((side - 1.0) / (math.sqrt(3.0) / 2.0))
+        points = sum(side if row % 2 == 0 else side - 1 for row in range(rows))
+        assert most_apart(side - 1.0, 1.0) >= points
+    assert most_apart(0.0, 1.0) == 1
+
+
+def test_a_grid_of_too_many_cells_is_named():
+    centres = np.array([[0.0, 0.0], [5e4, 0.0]])
+    ends = np.array([[-4e4, 0.0]]), np.array([[9e4, 0.0]])
+    with pytest.raises(ValueError, match="2 overlapping obstacles"):
+        way_exists(*ends, centres, np.full(2, 3e4), 0.15)
