@@ -126,6 +126,17 @@ class SpacecraftEpisode:
                 "lagros_envs.scenarios.Scenario (Scenario.load reads one from a file)"
             )
         self.world.check(scenario)
+        # No observation tells them, so that whoever flies takes the preset's.
+        for radius, own, wanted in (
+            ("agent_radius", scenario.agent_radius, self.preset.agent_radius),
+            ("core_radius", scenario.core, self.preset.core),
+        ):
+            if own != wanted:
+                raise ValueError(
+                    f"options[{name!r}] has {radius}={own!r}; this environment's preset has "
+                    f"{wanted!r}: build it with preset=dataclasses.replace(PRESETS[...], "
+                    f"{radius}={own!r})"
+                )
         return scenario
 
     def need_nominal(self, nominal: FloatArray | None) -> None:

@@ -1,5 +1,6 @@
 """The multi-agent environment through PettingZoo, and its single-agent form through Gymnasium."""
 
+import dataclasses
 import math
 import os
 
@@ -21,6 +22,7 @@ import lagros_envs  # noqa: F401 - registers the ids
 from lagros_envs import spacecraft_v0
 from lagros_envs.scenarios import PRESETS, Scenario
 from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
 
 METRIC = np.diag([2.0, 2.0, 1.0, 3.0, 3.0, 1.0])
 STILL = np.zeros(8, np.float32)
@@ -420,3 +422,19 @@ def test_importing_and_stepping_imports_no_heavy_library(run_python):
         "print(sorted(heavy & set(sys.modules)))"
     )
     assert printed == "[]\n"
+
+
+@pytest.mark.parametrize("change", [{"agent_radius": 0.2}, {"core_radius": 0.1}])
+def test_a_scenario_of_other_radii_than_the_presets_is_refused(change):
+    # Observations do not tell the radii: who flies would keep the wrong distances.
+    env = spacecraft_v0.parallel_env(2)
+    env.reset(seed=0)
+    (name,) = change
+    other = dataclasses.replace(env.scenario, **change)
+    with pytest.raises(ValueError, match=rf"{name}=.*preset has 0\.25"):
+        env.reset(options={"scenario": other})
+    worlds = SpacecraftVectorEnv(2, 2)
+    with pytest.raises(ValueError, match=rf"{name}=.*preset has 0\.25"):
+        worlds.reset(options={"scenarios": [other]})
+    fitting = dataclasses.replace(PRESETS["paper"], **change)
+    spacecraft_v0.parallel_env(2, fitting).reset(options={"scenario": other})
