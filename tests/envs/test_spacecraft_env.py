@@ -436,5 +436,7 @@ def test_a_scenario_of_other_radii_than_the_presets_is_refused(change):
     worlds = SpacecraftVectorEnv(2, 2)
     with pytest.raises(ValueError, match=rf"{name}=.*preset has 0\.25"):
         worlds.reset(options={"scenarios": [other]})
-    fitting = dataclasses.replace(PRESETS["paper"], **change)
+    fitting = dataclasses.replace(
+        PRESETS["paper"], agent_radius=other.agent_radius, core_radius=other.core
+    )
     spacecraft_v0.parallel_env(2, fitting).reset(options={"scenario": other})
