@@ -18,6 +18,9 @@ def main() -> None:
         if not hint:
             raise
         sys.exit(f"lagros: {error}{hint}")
+    except KeyboardInterrupt:
+        # Before a command has begun; what one says is in `terminal.Commands`.
+        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -21,11 +21,11 @@ from lagros_benchmarks.extras import check_extra
 from lagros_benchmarks.outputs import check_outputs, policy_files
 from lagros_benchmarks.streams import printing_failed
 from lagros_benchmarks.terminal import (
-    INTERRUPTED,
     Command,
     Commands,
     fail,
     find_users_modules,
+    interrupted,
     listed,
     listed_or_none,
     progress_bar,
@@ -282,6 +282,8 @@ def reproduce(
         fail(str(error).replace("worlds=", "--episodes="))
     except (ImportError, BackendError) as error:
         fail(error, status=1)
+    except KeyboardInterrupt:
+        interrupted(f"; the same command goes on with what is in {place}")
     run_and_report(benchmark, outputs, place / "benchmark", keep=True)
 
 
@@ -353,7 +355,7 @@ def run_and_report(
         # No weights, damaged weights, an extra that is not installed, a cluster that is not there.
         fail(error, status=1)
     except KeyboardInterrupt:
-        fail(f"interrupted{_where_kept(kept)}", status=INTERRUPTED)
+        interrupted(_where_kept(kept))
     rows = summarise(run)
     delivery = outputs.write(run, rows)
     print_report(rows)

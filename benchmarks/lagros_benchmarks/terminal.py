@@ -39,8 +39,9 @@ _LONGEST = 800  # letters of a message
 def fail(error: Exception | str, status: int = USAGE_ERROR) -> NoReturn:
     """Say what is wrong, without a traceback, and end with the exit status."""
     text = str(error)
-    if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        text = f"{error.filename}: {error.strerror}"
+    if isinstance(error, OSError) and error.strerror:
+        text = error.strerror
+        text = text if error.filename is None else f"{error.filename}: {text}"
     text = _shortened(_named_by_option(text))
     if isinstance(error, Exception) and "pip install" not in text:
         text += install_hint(error)
@@ -115,6 +116,12 @@ def _options(context: Any) -> dict[str, str]:
     }
 
 
+def interrupted(note: str = "") -> NoReturn:
+    """Say that Ctrl-C has ended a command, and what remains, and end with its exit status."""
+    typer.echo(f"lagros: interrupted{note}", err=True)
+    raise typer.Exit(INTERRUPTED)
+
+
 def _named_by_option(text: str) -> str:
     """Put the option before a message of the settings, which know the field but not the option."""
     context = _CONTEXT.get()
@@ -163,7 +170,7 @@ class Commands(TyperGroup):
         try:
             return super().invoke(context)
         except KeyboardInterrupt:
-            fail("interrupted", status=INTERRUPTED)
+            interrupted()
         except ModuleNotFoundError as error:
             if not install_hint(error):
                 raise

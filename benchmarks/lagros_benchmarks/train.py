@@ -16,7 +16,7 @@ import typer
 
 from lagros_benchmarks.extras import check_extra
 from lagros_benchmarks.outputs import Delivery, check_outputs
-from lagros_benchmarks.terminal import INTERRUPTED, fail, listed
+from lagros_benchmarks.terminal import fail, interrupted, listed
 
 if TYPE_CHECKING:
     from lagros_benchmarks.training.settings import Training
@@ -114,7 +114,7 @@ def train(
         # An extra that is not installed, a folder of another run, a full disk.
         fail(error, status=1)
     except KeyboardInterrupt:
-        fail(f"interrupted; the same command goes on with what is in {out}", status=INTERRUPTED)
+        interrupted(f"; the same command goes on with what is in {out}")
     _write_curves(records, json, figure).tell()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import typing
@@ -253,3 +254,35 @@ def test_where_there_is_no_place_left_the_text_is_printed(tmp_path, monkeypatch,
     assert told.out == "the text\n"
     assert "printed instead" in told.err
     assert "no room in the temporary folder either" in told.err
+
+
+# What happens to any command
+
+
+@pytest.mark.parametrize("command", [*START, "demo"])
+@pytest.mark.parametrize(
+    ("error", "status", "text"),
+    [
+        (KeyboardInterrupt(), 130, "lagros: interrupted"),
+        (OSError(errno.ENOSPC, "No space left on device"), 1, "No space left on device"),
+        (OSError(errno.EIO, "Input/output error", "a/b"), 1, "lagros: a/b: Input/output error"),
+        (MemoryError(), 1, "memory"),
+    ],
+    ids=["ctrl-c", "disk", "file", "memory"],
+)
+def test_what_ends_a_command_is_said_in_one_line(
+    tmp_path, monkeypatch, command, error, status, text
+):
+    def ends(*_, **__):
+        raise error
+
+    monkeypatch.chdir(tmp_path)
+    for name in WORK:
+        monkeypatch.setattr(name, ends)
+    more = ["--video", "x.gif"] if command == "watch" else []
+    result = CliRunner().invoke(cli.app, [*START.get(command, command).split(), *more])
+    # An attack may be told of a file that is not there.
+    assert result.exit_code in (status, 2 if command == "attack" else status), result.output
+    assert text in result.stderr
+    assert sum(line.startswith("lagros: ") for line in result.stderr.splitlines()) == 1
+    assert isinstance(result.exception, SystemExit)
