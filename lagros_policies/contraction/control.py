@@ -13,12 +13,18 @@ from lagros_envs.dynamics import (
     control_matrix,
     hold_control_slope,
     hold_step,
+    linearise_hold,
     vector_field,
 )
 from lagros_policies.contraction.metric import ContractionMetric
 from lagros_policies.contraction.systems import check_angle, check_sizes
 
 FloatArray = NDArray[np.float64]
+
+# Eigenvalues below this share of the largest are zero but for rounding.
+_UNSEEN = 1e-13
+_NEWTON_STEPS = 60
+_STEP_TOLERANCE = 1e-14
 
 
 def error_energy(matrix: FloatArray, error: FloatArray) -> FloatArray:
@@ -116,19 +122,18 @@ class HeldControl:
 
         (e' + G v)' M(x') (e' + G v) <= exp(-2 alpha dt) e'Me,  e' = F(x, u_d) - F(x_d, u_d),
 
-    G = dF/du(x, u_d), x' = F(x, u_d). With one control that is an interval, whose point nearest to
-    the preferred v is taken: for a preferred v of zero the least deviation, as in (17). Where the
-    interval is empty, outside the metric's region, the v of least energy is taken.
+    G = dF/du(x, u_d), x' = F(x, u_d). That is an ellipsoid of v, with one control an interval,
+    whose point nearest to the preferred v is taken: for a preferred v of zero the least deviation,
+    as in (17). Where it is empty, outside the metric's region, the v of least energy is taken.
 
     Attributes:
-        system: A system with one control.
+        system: The system.
         metric: The metric.
         rate: alpha of the control law [1/s].
         period: Control period dt [s].
 
     Raises:
-        ValueError: The system has more than one control or other states than the metric, or the
-            rate exceeds the metric's.
+        ValueError: The system has other states than the metric, or the rate exceeds the metric's.
     """
 
     system: System
@@ -138,11 +143,6 @@ class HeldControl:
 
     def __post_init__(self) -> None:
         """Check system and rate."""
-        if self.system.control_dim != 1:
-            raise ValueError(
-                f"HeldControl is closed form for one control, not {self.system.control_dim}; "
-                "use robust_control"
-            )
         size = len(self.metric.scaling)
         if size != self.system.state_dim:
             raise ValueError(
@@ -159,21 +159,34 @@ class HeldControl:
     def quadratic(
         self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return a, b, c, each (...): the condition reads a v^2 + 2 b v + c <= 0."""
-        following, gain = hold_control_slope(self.system, state, nominal_control, self.period)
+        """Return a, b, c of the condition v'a v + 2 b'v + c <= 0.
+
+        Args:
+            state: x, shape (..., n).
+            nominal: x_d, shape (..., n).
+            nominal_control: u_d, shape (..., m).
+
+        Returns:
+            a (..., m, m), b (..., m) and c (...); with one control each of them (...).
+        """
+        if self.system.control_dim == 1:
+            following, slope = hold_control_slope(self.system, state, nominal_control, self.period)
+            gain = slope[..., None]
+        else:
+            following, _, gain = linearise_hold(self.system, state, nominal_control, self.period)
         error = following - hold_step(self.system, nominal, nominal_control, self.period)
         matrix = self.metric.matrix(following)
-        pull = np.einsum("...ij,...j->...i", matrix, gain)
-        a: FloatArray = np.einsum("...i,...i->...", gain, pull)
-        b: FloatArray = np.einsum("...i,...i->...", error, pull)
+        pull = np.einsum("...ij,...jk->...ik", matrix, gain)
+        a = np.einsum("...ij,...ik->...jk", gain, pull)
+        b = np.einsum("...i,...ij->...j", error, pull)
         before = error_energy(self.metric.matrix(state), state - nominal)
         c = error_energy(matrix, error) - np.exp(-2.0 * self.rate * self.period) * before
-        return a, b, c
+        return (a[..., 0, 0], b[..., 0], c) if self.system.control_dim == 1 else (a, b, c)
 
     def interval(
         self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the least and the largest v that contract, each (...).
+        """Return the least and the largest v that contract, each (...), of a single control.
 
         Args:
             state: x, shape (..., n).
@@ -182,7 +195,15 @@ class HeldControl:
 
         Returns:
             Both ends; where nothing contracts, both are the v of least energy.
+
+        Raises:
+            ValueError: The system has more than one control.
         """
+        if self.system.control_dim != 1:
+            raise ValueError(
+                f"{self.system!r} has {self.system.control_dim} controls: what contracts is an "
+                "ellipsoid, see quadratic()"
+            )
         a, b, c = self.quadratic(state, nominal, nominal_control)
         root = np.sqrt(np.maximum(b * b - a * c, 0.0))
         return (-b - root) / a, (-b + root) / a
@@ -194,18 +215,81 @@ class HeldControl:
         nominal_control: FloatArray,
         preferred: FloatArray | float = 0.0,
     ) -> FloatArray:
-        """Return u*, shape (..., 1).
+        """Return u*, shape (..., m).
 
         Args:
             state: x, shape (..., n).
             nominal: x_d, shape (..., n).
-            nominal_control: u_d, shape (..., 1).
-            preferred: v that is taken where it contracts, shape (...).
+            nominal_control: u_d, shape (..., m).
+            preferred: v that is taken where it contracts, shape (..., m); (...) of one control.
 
         Returns:
             u_d plus the contracting v nearest to the preferred one.
         """
-        low, high = self.interval(state, nominal, nominal_control)
-        deviation = np.clip(preferred, low, high)
-        control: FloatArray = nominal_control + deviation[..., None]
+        control: FloatArray
+        if self.system.control_dim == 1:
+            low, high = self.interval(state, nominal, nominal_control)
+            control = nominal_control + np.clip(preferred, low, high)[..., None]
+        else:
+            ellipsoid = self.quadratic(state, nominal, nominal_control)
+            control = nominal_control + nearest_in_ellipsoid(*ellipsoid, np.asarray(preferred))
         return control
+
+
+def nearest_in_ellipsoid(
+    a: FloatArray, b: FloatArray, c: FloatArray, point: FloatArray
+) -> FloatArray:
+    """Return the v nearest to a point with v'a v + 2 b'v + c <= 0.
+
+    In the eigenvectors of a the condition is sum_i a_i y_i^2 <= r^2 with y the distance from the
+    centre -b / a. The nearest y is y_i = p_i / (1 + lambda a_i), and lambda >= 0 is the one root of
+    1 / |y|_a = 1 / r, a concave function on which Newton's method rises from zero.
+
+    Args:
+        a: Positive semidefinite, shape (..., m, m).
+        b: In the range of a, shape (..., m).
+        c: Shape (...).
+        point: The point, shape (..., m).
+
+    Returns:
+        v, shape (..., m): the point itself where it is inside, the centre where nothing is.
+    """
+    values, vectors = np.linalg.eigh(a)
+    # A direction that a does not see is left alone.
+    seen = values > _UNSEEN * values[..., -1:]
+    size = np.where(seen, values, 1.0)
+    centre = np.where(seen, -np.einsum("...ji,...j->...i", vectors, b) / size, 0.0)
+    offset = np.einsum("...ji,...j->...i", vectors, np.broadcast_to(point, b.shape)) - centre
+    weight = np.where(seen, values, 0.0)
+    square = np.einsum("...i,...i->...", weight * centre, centre) - c
+    radius = np.sqrt(np.maximum(square, 0.0))
+    outside = np.einsum("...i,...i->...", weight * offset, offset) > radius * radius
+    possible = outside & (radius > 0.0)
+    # The others take part with a problem that is solved.
+    target = np.where(possible, radius, 1.0)
+    begin = np.where(possible[..., None], offset, 0.0)
+    multiplier = np.zeros(radius.shape)
+    for _ in range(_NEWTON_STEPS):
+        scaled = begin / (1.0 + multiplier[..., None] * weight)
+        energy = np.einsum("...i,...i->...", weight * scaled, scaled)
+        reached = np.sqrt(energy)
+        slope = np.einsum(
+            "...i,...i->...",
+            weight * weight * scaled * scaled,
+            1.0 / (1.0 + multiplier[..., None] * weight),
+        )
+        step = np.where(possible, (reached / target - 1.0) * energy, 0.0)
+        step = np.divide(step, slope, out=np.zeros_like(step), where=slope > 0.0)
+        multiplier = multiplier + np.maximum(step, 0.0)
+        if np.all(step <= _STEP_TOLERANCE * multiplier):
+            break
+    nearest = begin / (1.0 + multiplier[..., None] * weight)
+    # Onto the surface, where rounding and the last step have left a little.
+    reached = np.sqrt(np.einsum("...i,...i->...", weight * nearest, nearest))
+    shrink = np.where(possible, target / np.where(reached > 0.0, reached, 1.0), 1.0)
+    nearest = nearest * np.where(seen, np.minimum(shrink, 1.0)[..., None], 1.0)
+    chosen = np.where(outside[..., None], np.where(possible[..., None], nearest, 0.0), offset)
+    # Where nothing contracts the seen directions go to the centre, the others stay.
+    chosen = np.where(seen, chosen, offset)
+    found: FloatArray = np.einsum("...ij,...j->...i", vectors, centre + chosen)
+    return found

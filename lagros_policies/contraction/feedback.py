@@ -132,32 +132,33 @@ class GainTable:
 def riccati_gains(
     by_state: FloatArray, by_control: FloatArray, state: FloatArray, control: FloatArray
 ) -> FloatArray:
-    """Solve the backward Riccati recursion of a time-varying regulator with one control.
+    """Solve the backward Riccati recursion of a time-varying regulator.
 
     Args:
         by_state: A_k, shape (..., N, n, n).
-        by_control: B_k, shape (..., N, n).
+        by_control: B_k, shape (..., N, n, m).
         state: Diagonals of Q_k, shape (..., N + 1, n).
-        control: R_k, shape (..., N).
+        control: Diagonals of R_k, shape (..., N, m).
 
     Returns:
-        K_k of v = -K_k e, shape (..., N, n).
+        K_k of v = -K_k e, shape (..., N, m, n).
     """
-    steps = by_state.shape[-3]
-    n = by_state.shape[-1]
+    steps, n, m = by_control.shape[-3:]
     batch = np.broadcast_shapes(by_state.shape[:-3], state.shape[:-2])
-    gains = np.empty((*batch, steps, n))
+    gains = np.empty((*batch, steps, m, n))
     eye = np.eye(n)
     value = np.broadcast_to(_TERMINAL_WEIGHT * state[..., -1, :, None] * eye, (*batch, n, n))
     for step in range(steps - 1, -1, -1):
-        slope, push = by_state[..., step, :, :], by_control[..., step, :, None]
+        slope, push = by_state[..., step, :, :], by_control[..., step, :, :]
         ahead = value @ slope
         pull = np.swapaxes(push, -1, -2) @ ahead
-        stiffness = (np.swapaxes(push, -1, -2) @ value @ push)[..., 0, 0]
-        gain = pull / (control[..., step] + stiffness)[..., None, None]
+        stiffness = np.swapaxes(push, -1, -2) @ value @ push
+        stiffness = control[..., step, :, None] * np.eye(m) + stiffness
+        # A quotient of numbers is several times faster than a system of one equation.
+        gain = pull / stiffness if m == 1 else np.linalg.solve(stiffness, pull)
         value = state[..., step, :, None] * eye + np.swapaxes(slope, -1, -2) @ ahead
         value = value - np.swapaxes(pull, -1, -2) @ gain
-        gains[..., step, :] = gain[..., 0, :]
+        gains[..., step, :, :] = gain
     return gains
 
 
@@ -195,8 +196,9 @@ def gain_table(
         )
     schedules = [schedule.at(times) for schedule in (settings.tight, settings.gentle)]
     state = np.stack([weights for weights, _ in schedules])[:, None]
-    control = np.stack([weights for _, weights in schedules])[:, None, :-1]
-    tight, gentle = riccati_gains(by_state[None], by_control[None], state, control)
+    control = np.stack([weights for _, weights in schedules])[:, None, :-1, None]
+    pushes = by_control[None, ..., None]
+    tight, gentle = riccati_gains(by_state[None], pushes, state, control)[..., 0, :]
     closed = by_state - by_control[..., None] * tight[..., None, :]
     padding = np.zeros((len(closed), settings.lookahead, *closed.shape[2:]))
     return GainTable(tight, gentle, np.concatenate([closed, padding], axis=1))

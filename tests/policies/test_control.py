@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cvxpy as cp
 import gymnasium as gym
 import numpy as np
 import osqp
@@ -12,6 +13,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import lagros_envs  # noqa: F401  registers the environment
+from lagros_envs.dynamics import hold_step, linearise_hold
 from lagros_policies.contraction import (
     CvStemSettings,
     HeldControl,
@@ -20,6 +22,7 @@ from lagros_policies.contraction import (
     extreme_eigenvalues,
     robust_control,
 )
+from lagros_policies.contraction.control import error_energy, nearest_in_ellipsoid
 
 PERIOD = 0.1
 unit = st.floats(-1.0, 1.0)
@@ -261,9 +264,89 @@ def test_held_control_agrees_with_the_nonlinear_prediction_for_small_errors(
     assert acted > 10
 
 
-def test_held_control_refuses_two_controls(metric):
-    with pytest.raises(ValueError, match="one control"):
-        HeldControl(TwoForces(), metric, 0.5, 0.1)
+class ThreeForces(TwoForces):
+    """The same body with a third force, which pushes along both axes."""
+
+    control_dim = 3
+
+    def derivative(self, state, control, functions):
+        v, w, push, turn = super().derivative(state, control, functions)
+        return v, w, push + 0.5 * control[2], turn - functions.cos(state[0]) * control[2]
+
+
+@pytest.mark.parametrize("controls", [2, 3])
+def test_held_control_of_several_controls_is_that_of_a_conic_program(metric, controls):
+    system = TwoForces() if controls == 2 else ThreeForces()
+    constant = replace(metric, coefficients=metric.dual(np.zeros(4))[None])
+    law = HeldControl(system, constant, 0.5, PERIOD)
+    rng = np.random.default_rng(controls)
+    found = set()
+    for size in (0.02, 0.3):
+        for _ in range(10):
+            nominal = rng.uniform(-0.5, 0.5, 4)
+            state = nominal + size * rng.standard_normal(4)
+            nominal_control, preferred = rng.uniform(-3.0, 3.0, (2, controls))
+            u = law(state, nominal, nominal_control, preferred)
+            following, _, slope = linearise_hold(system, state, nominal_control, PERIOD)
+            error = following - hold_step(system, nominal, nominal_control, PERIOD)
+            root = np.linalg.cholesky(constant.matrix(following)).T
+            before = error_energy(constant.matrix(state), state - nominal)
+            limit = np.sqrt(np.exp(-2.0 * 0.5 * PERIOD) * before)
+            v = cp.Variable(controls)
+            reached = cp.norm(root @ (error + slope @ v))
+            program = cp.Problem(cp.Minimize(cp.sum_squares(v - preferred)), [reached <= limit])
+            program.solve(cp.CLARABEL, tol_gap_abs=1e-9, tol_gap_rel=1e-9, tol_feas=1e-9)
+            if program.status == cp.OPTIMAL:
+                found.add("acts" if np.linalg.norm(v.value - preferred) > 1e-4 else "rests")
+                assert u - nominal_control == pytest.approx(v.value, abs=1e-4, rel=1e-4)
+            else:
+                found.add("fails")
+                least = np.linalg.lstsq(root @ slope, -root @ error, rcond=None)[0]
+                moved = np.linalg.norm(root @ (error + slope @ (u - nominal_control)))
+                lowest = np.linalg.norm(root @ (error + slope @ least))
+                assert moved == pytest.approx(lowest, rel=1e-6)
+    assert "acts" in found
+
+
+def test_several_states_are_answered_as_each_alone(metric):
+    constant = replace(metric, coefficients=metric.dual(np.zeros(4))[None])
+    law = HeldControl(TwoForces(), constant, 0.5, PERIOD)
+    rng = np.random.default_rng(0)
+    nominal, control = rng.uniform(-0.5, 0.5, (6, 4)), rng.uniform(-1.0, 1.0, (6, 2))
+    state = nominal + 0.1 * rng.standard_normal((6, 4))
+    together = law(state, nominal, control)
+    for row in range(6):
+        alone = law(state[row], nominal[row], control[row])
+        assert alone == pytest.approx(together[row], rel=1e-9, abs=1e-9)
+    with pytest.raises(ValueError, match="ellipsoid"):
+        law.interval(state, nominal, control)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5])
+def test_the_nearest_point_of_an_ellipsoid_is_that_of_a_conic_program(size):
+    rng = np.random.default_rng(size)
+    for spread in (1.0, 1e3):
+        root = np.diag(np.geomspace(1.0, spread, size)) @ rng.standard_normal((size, size))
+        centre, point = rng.standard_normal((2, size))
+        a = root.T @ root
+        b, c = -a @ centre, centre @ a @ centre - 0.2
+        found = nearest_in_ellipsoid(a, b, np.array(c), 3.0 * point)
+        v = cp.Variable(size)
+        inside = cp.norm(root @ (v - centre)) <= np.sqrt(0.2)
+        cp.Problem(cp.Minimize(cp.sum_squares(v - 3.0 * point)), [inside]).solve(cp.CLARABEL)
+        # The program stops within its tolerance; the closed form may only be nearer.
+        assert found == pytest.approx(v.value, abs=2e-4)
+        apart = np.linalg.norm(found - 3.0 * point), np.linalg.norm(v.value - 3.0 * point)
+        assert apart[0] <= apart[1] + 1e-6
+        assert found @ a @ found + 2.0 * b @ found + c <= 1e-9 * (1.0 + abs(c))
+
+
+def test_directions_that_the_ellipsoid_does_not_see_are_left_alone():
+    a = np.diag([4.0, 0.0])
+    found = nearest_in_ellipsoid(a, np.array([-4.0, 0.0]), np.array(3.0), np.array([9.0, 7.0]))
+    assert found == pytest.approx([1.5, 7.0])
+    centre = nearest_in_ellipsoid(a, np.array([-4.0, 0.0]), np.array(9.0), np.array([9.0, 7.0]))
+    assert centre == pytest.approx([1.0, 7.0])
 
 
 def test_continuous_loop_contracts_at_the_rate_of_theorem_2(metric, system, oracle, plans):

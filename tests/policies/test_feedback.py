@@ -18,36 +18,37 @@ from lagros_policies.expert import CartPoleExpert
 STEPS, N = 12, 3
 
 
-def random_regulator(seed):
+def random_regulator(seed, controls):
     rng = np.random.default_rng(seed)
     by_state = np.eye(N) + 0.3 * rng.standard_normal((STEPS, N, N))
-    by_control = rng.standard_normal((STEPS, N))
+    by_control = rng.standard_normal((STEPS, N, controls))
     state = rng.uniform(0.1, 2.0, (STEPS + 1, N))
-    control = rng.uniform(0.1, 2.0, STEPS)
+    control = rng.uniform(0.1, 2.0, (STEPS, controls))
     return by_state, by_control, state, control
 
 
 def first_control(by_state, by_control, state, control, error):
     """Return v_0 of the least cost over all controls at once, by linear least squares."""
-    steps = len(control)
-    free, forced = error, np.zeros((N, steps))
+    steps, m = control.shape
+    free, forced = error, np.zeros((N, steps * m))
     # The last stage weighs ten times its stage weight.
     rows = [np.sqrt(state[0])[:, None] * forced]
     target = [-np.sqrt(state[0]) * free]
     for k in range(steps):
         free, forced = by_state[k] @ free, by_state[k] @ forced
-        forced[:, k] += by_control[k]
+        forced[:, k * m : (k + 1) * m] += by_control[k]
         weight = np.sqrt(state[k + 1] * (10.0 if k == steps - 1 else 1.0))
         rows.append(weight[:, None] * forced)
         target.append(-weight * free)
-    rows.append(np.diag(np.sqrt(control)))
-    target.append(np.zeros(steps))
-    return np.linalg.lstsq(np.vstack(rows), np.concatenate(target), rcond=None)[0][0]
+    rows.append(np.diag(np.sqrt(control.ravel())))
+    target.append(np.zeros(steps * m))
+    return np.linalg.lstsq(np.vstack(rows), np.concatenate(target), rcond=None)[0][:m]
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_riccati_gain_is_the_least_squares_control_at_every_step(seed):
-    by_state, by_control, state, control = random_regulator(seed)
+@pytest.mark.parametrize("controls", [1, 2, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_riccati_gain_is_the_least_squares_control_at_every_step(seed, controls):
+    by_state, by_control, state, control = random_regulator(seed, controls)
     gains = riccati_gains(by_state, by_control, state, control)
     error = np.random.default_rng(seed + 100).standard_normal(N)
     for k in range(STEPS):
@@ -56,18 +57,18 @@ def test_riccati_gain_is_the_least_squares_control_at_every_step(seed):
 
 
 def test_riccati_gain_far_from_the_end_is_the_stationary_one():
-    by_state, by_control, state, control = (part[:1] for part in random_regulator(7))
+    by_state, by_control, state, control = (part[:1] for part in random_regulator(7, 2))
     count = 400
     gains = riccati_gains(
         np.repeat(by_state, count, 0),
         np.repeat(by_control, count, 0),
         np.repeat(state, count + 1, 0),
-        np.repeat(control, count),
+        np.repeat(control, count, 0),
     )
-    slope, push = by_state[0], by_control[0][:, None]
-    value = scipy.linalg.solve_discrete_are(slope, push, np.diag(state[0]), np.diag(control))
-    stiffness = control + push.T @ value @ push
-    assert gains[0] == pytest.approx((push.T @ value @ slope / stiffness)[0])
+    slope, push = by_state[0], by_control[0]
+    value = scipy.linalg.solve_discrete_are(slope, push, np.diag(state[0]), np.diag(control[0]))
+    stiffness = np.diag(control[0]) + push.T @ value @ push
+    assert gains[0] == pytest.approx(np.linalg.solve(stiffness, push.T @ value @ slope))
 
 
 def test_weights_follow_their_schedule():
@@ -101,7 +102,8 @@ def test_table_holds_both_gains_and_the_loop_closed_by_the_tight_one(table):
     for plan in (0, 5):
         for schedule, found in ((settings.tight, gains.tight), (settings.gentle, gains.gentle)):
             state, control = schedule.at(0.1 * np.arange(91))
-            expected = riccati_gains(by_state[plan], by_control[plan], state, control[:-1])
+            pushes, weights = by_control[plan][..., None], control[:-1, None]
+            expected = riccati_gains(by_state[plan], pushes, state, weights)[:, 0]
             assert found[plan] == pytest.approx(expected, rel=1e-6, abs=1e-6)
         closed = by_state[plan] - by_control[plan][:, :, None] * gains.tight[plan][:, None, :]
         assert gains.closed[plan, :90] == pytest.approx(closed, rel=1e-9, abs=1e-9)

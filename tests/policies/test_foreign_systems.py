@@ -406,8 +406,6 @@ def test_controls_of_a_metric_of_the_angle_are_refused_elsewhere():
 def test_a_held_control_is_of_the_states_of_its_metric():
     with pytest.raises(ValueError, match="the metric is of 4 states"):
         HeldControl(Ramp(), angle_metric(), 0.1, 0.1)
-    with pytest.raises(ValueError, match="one control"):
-        HeldControl(Pvtol(), constant_metric(6), 0.1, 0.1)
     # For an angle that it does not turn by itself it is right: it asks for no rate.
     law, samples = HeldControl(Ramp(), constant_metric(2), 0.2, 0.05), drawn(Ramp())
     u = law(samples.state, samples.nominal, samples.nominal_control)
