@@ -346,18 +346,20 @@ def run_and_report(
 
     kept = kept_in(folder, settings)
     if len(kept):
-        progress_line(f"going on with {len(kept)} finished chunks of {kept.folder}")
+        progress_line(
+            f"going on with {len(kept)} finished chunks of {kept.folder}; remove it to begin anew"
+        )
     try:
         # What policies print is not ours, and where they go is no matter.
         with progress_bar() as progress, redirect_stdout(sys.stderr), chdir("."):
             run = run_benchmark(settings, progress=progress, kept=kept)
+        rows = summarise(run)
+        delivery = outputs.write(run, rows)
     except (SetupError, BackendError) as error:
         # No weights, damaged weights, an extra that is not installed, a cluster that is not there.
         fail(error, status=1)
     except KeyboardInterrupt:
         interrupted(_where_kept(kept))
-    rows = summarise(run)
-    delivery = outputs.write(run, rows)
     print_report(rows)
     if delivery.problems or not (delivery.written or printing_failed() is None):
         progress_line(f"lagros: something was not written or printed{_where_kept(kept)}")

@@ -16,6 +16,11 @@ from lagros_benchmarks.settings import BenchmarkSettings
 from lagros_benchmarks.surroundings import machine, threads, versions
 
 _PACKAGES = ("lagros_envs", "lagros_policies", "lagros_benchmarks")
+# Modules, weights and settings that a class of the user's own may read.
+_BESIDE = {
+    *(".py", ".npz", ".npy", ".pt", ".pth", ".safetensors", ".zip", ".onnx", ".h5"),
+    *(".json", ".yaml", ".yml", ".toml"),
+}
 # What changes no result; whether the work is done in parallel does, for it decides what is timed.
 _FREE = ("jobs", "backend")
 
@@ -65,7 +70,7 @@ def _named_files(value: Any) -> Iterator[tuple[str, list[Path]]]:
 
 
 def _module_files(module: str) -> list[Path]:
-    """Return the files of a module, and those beside it, which it may import."""
+    """Return the files of a module, and those beside it, which it may import or read."""
     try:
         found = importlib.util.find_spec(module.partition(".")[0])
     except (ImportError, ValueError):
@@ -74,7 +79,10 @@ def _module_files(module: str) -> list[Path]:
         return []
     if found.submodule_search_locations:
         return [path for place in found.submodule_search_locations for path in _files(Path(place))]
-    return [] if found.origin is None else sorted(Path(found.origin).parent.glob("*.py"))
+    if found.origin is None:
+        return []
+    beside = Path(found.origin).parent.glob("*")
+    return sorted(path for path in beside if path.suffix in _BESIDE and path.is_file())
 
 
 def _files(folder: Path) -> list[Path]:

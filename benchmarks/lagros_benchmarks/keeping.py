@@ -44,11 +44,13 @@ class Kept:
         """Nothing is read or written yet."""
         self.folder = folder
         self.key = key
+        # A policy may change the working folder.
+        self._place = folder.absolute()
         self._failed = False
 
     def __len__(self) -> int:
         """Return the number of files."""
-        return sum(1 for _ in self.folder.glob("*.json"))
+        return sum(1 for _ in self._place.glob("*.json"))
 
     def found(self, title: str, count: int) -> dict[int, Any]:
         """Return the chunks of one stage that are there and whole, by index.
@@ -85,10 +87,10 @@ class Kept:
 
     def remove(self) -> None:
         """Remove all chunks, with the folder."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        shutil.rmtree(self._place, ignore_errors=True)
 
     def _path(self, title: str, index: int) -> Path:
-        return self.folder / f"{title}-{index:05d}.json"
+        return self._place / f"{title}-{index:05d}.json"
 
     def _checksum(self, title: str, index: int, body: str) -> str:
         # With its place, so that a file that was renamed is not taken for another.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
+from contextlib import chdir, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -116,7 +118,10 @@ def _draw_scene(run: BenchmarkRun, world: int, path: Path) -> None:
     from lagros_benchmarks.runner import fly_scene
     from lagros_benchmarks.scene_figure import scene_figure
 
-    scene_figure(fly_scene(run.settings, world), path)
+    # As in the run: what policies print is not ours, and where they go is no matter.
+    with redirect_stdout(sys.stderr), chdir("."):
+        scene = fly_scene(run.settings, world)
+    scene_figure(scene, path)
 
 
 def print_report(rows: Sequence[Row]) -> None:

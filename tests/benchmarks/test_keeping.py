@@ -151,6 +151,17 @@ def test_a_chunk_of_another_place_or_run_is_not_taken(tmp_path):
     assert Kept(tmp_path, "another").found("episodes", 2) == {}
 
 
+def test_a_policy_may_change_the_working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    kept = Kept(Path("runs"), "key")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    kept.add("episodes", 0, 1)
+    monkeypatch.chdir(tmp_path)
+    assert os.listdir("runs") == ["episodes-00000.json"]
+    assert kept.found("episodes", 1) == {0: 1}
+
+
 # Runs
 
 
@@ -244,7 +255,8 @@ def test_the_key_changes_with_all_that_a_result_depends_on(tmp_path, monkeypatch
         key(jobs=2),  # other processes contend for the one whose steps are timed
         fingerprint(settings, fakes.EASY),
     ]
-    for path in (model, module, metric, tmp_path / "helper.py"):
+    weights = tmp_path / "weights.npz"
+    for path in (model, module, metric, tmp_path / "helper.py", weights):
         path.write_text("2")
         different.append(key())
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
