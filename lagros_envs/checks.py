@@ -18,6 +18,8 @@ from typing import Any, Literal, TypeGuard, Union, get_args, get_origin, get_typ
 
 # Control steps of an episode, whose states are kept.
 MOST_STEPS = 1_000_000
+# Of d_bar: under a thousandth of it nothing flies, and squares of the states stay numbers.
+MOST_BOUND = 1e6
 # As much as NumPy recommends as the entropy of a seed.
 MOST_SEEDS = 1 << 128
 # Of a coordinate, a size, a rate or a weight: observations hold it in single precision, and no
@@ -50,6 +52,16 @@ def check_not_negative(name: str, value: float, otherwise: str = "") -> None:
     """
     holds = is_finite(value) and value >= 0.0
     _check(holds, name, value, "finite and >= 0", otherwise)
+
+
+def check_disturbance_bound(name: str, value: float, otherwise: str = "") -> None:
+    """Check d_bar of a disturbance [units of the state per second]; the rest as `check_positive`.
+
+    Raises:
+        ValueError: It is no number, negative, NaN, or so large that no flight stays a number.
+    """
+    holds = is_number(value) and 0.0 <= value <= MOST_BOUND
+    _check(holds, name, value, f"finite and >= 0, at most {MOST_BOUND:g}", otherwise)
 
 
 def check_at_least(name: str, value: float, least: float, otherwise: str = "") -> None:

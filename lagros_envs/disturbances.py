@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_not_negative, shown, suggestion
+from lagros_envs.checks import check_disturbance_bound, shown, suggestion
 from lagros_envs.options import real_numbers
 from lagros_envs.values import ByValue
 
@@ -237,7 +237,7 @@ class Disturbance(ByValue):
                 f"disturbance={shown(self.kind)} is not known; use one of {', '.join(KINDS)} or a "
                 f"callable.{suggestion(self.kind, KINDS)}"
             )
-        check_not_negative("disturbance_bound", self.bound)
+        check_disturbance_bound("disturbance_bound", self.bound)
         if not any(self.channels):
             raise ValueError("channels must leave at least one state disturbed")
         if self.kind == "worst" and self.metric is None:

@@ -63,7 +63,7 @@ def certify(
     Ends with status 1 if anything that it claims does not hold.
     """
     from lagros_benchmarks.settings import check_task
-    from lagros_envs.checks import check_positive, check_whole, shown
+    from lagros_envs.checks import check_disturbance_bound, check_positive, check_whole, shown
     from lagros_envs.reading import check_file
 
     try:
@@ -75,6 +75,7 @@ def certify(
             )
         if bound is not None:
             check_positive("bound", bound)
+            check_disturbance_bound("bound", bound)
         if episodes is not None:
             check_whole("episodes", episodes, 0, _MOST_EPISODES)
         check_positive("seconds", seconds)

@@ -16,8 +16,8 @@ from lagros_benchmarks.video import FRAME_RATES, Frame, check_video_path, video_
 from lagros_benchmarks.watched import CartPoleGame, SpacecraftGame
 from lagros_envs.canvas import import_pygame
 from lagros_envs.checks import (
+    check_disturbance_bound,
     check_fields,
-    check_not_negative,
     check_positive,
     check_seed,
     check_whole,
@@ -86,7 +86,7 @@ class WatchSettings:
             check_whole("agents", self.agents, 1, MOST_AGENTS)
         check_seed(self.seed)
         if self.bound is not None:
-            check_not_negative("bound", self.bound)
+            check_disturbance_bound("bound", self.bound)
         if self.speed is not None:
             check_positive("speed", self.speed)
             if not SLOWEST <= self.speed <= FASTEST:

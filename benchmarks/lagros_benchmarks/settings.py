@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from lagros_envs.checks import (
+    check_disturbance_bound,
     check_fields,
-    check_not_negative,
     check_seed,
     check_whole,
     shown,
@@ -184,7 +184,7 @@ class BenchmarkSettings:
             if kind not in KINDS:
                 raise ValueError(unknown_name("disturbance", kind, KINDS))
         for bound in self.bounds:
-            check_not_negative("bound", bound)
+            check_disturbance_bound("bound", bound)
         if self.channels not in CHANNELS:
             raise ValueError(unknown_name("channels", self.channels, CHANNELS))
         for name, most in _MOST.items():

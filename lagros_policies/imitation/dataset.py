@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
-from lagros_envs.checks import check_fields, check_not_negative, check_seed, check_whole
+from lagros_envs.checks import (
+    check_disturbance_bound,
+    check_fields,
+    check_not_negative,
+    check_seed,
+    check_whole,
+)
 from lagros_envs.disturbances import OPEN_LOOP, into_unit_ball
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
@@ -68,8 +74,8 @@ class ExpertDataSettings:
             )
         for name in ("plans", "samples"):
             check_whole(name, getattr(self, name))
-        for name in ("disturbance_bound", "spread"):
-            check_not_negative(name, getattr(self, name))
+        check_disturbance_bound("disturbance_bound", self.disturbance_bound)
+        check_not_negative("spread", self.spread)
 
 
 @dataclass(frozen=True)

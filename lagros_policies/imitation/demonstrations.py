@@ -18,7 +18,13 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_fields, check_name, check_not_negative, check_seed, check_whole
+from lagros_envs.checks import (
+    check_disturbance_bound,
+    check_fields,
+    check_name,
+    check_seed,
+    check_whole,
+)
 from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.observation import global_state
 from lagros_envs.seeding import episode_seeds
@@ -69,7 +75,7 @@ class DemonstrationSettings:
                 "reads the data must be able to repeat it without the expert's plan"
             )
         if self.bound is not None:
-            check_not_negative("bound", self.bound, "or None for the task's own")
+            check_disturbance_bound("bound", self.bound, "or None for the task's own")
 
     @property
     def disturbance_bound(self) -> float:

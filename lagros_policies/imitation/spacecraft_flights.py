@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import (
     check_above,
+    check_disturbance_bound,
     check_each,
     check_fields,
     check_name,
-    check_not_negative,
     check_seed,
     check_whole,
 )
@@ -91,7 +91,7 @@ class FlightSettings:
         check_each("agents", self.agents, 1, MOST_AGENTS)
         check_each("sample_after", self.sample_after, 0)
         check_whole("sample_every", self.sample_every)
-        check_not_negative("disturbance_bound", self.disturbance_bound)
+        check_disturbance_bound("disturbance_bound", self.disturbance_bound)
         if not 0.0 <= self.open_share <= 1.0:
             raise ValueError(f"open_share={self.open_share!r} must be in [0, 1]")
         if self.replan_period is not None:

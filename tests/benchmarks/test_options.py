@@ -23,6 +23,8 @@ NAMES = ("", "nonsense", "None", "ünï🚀", "a b", "-", "--", LONG, "a\0b", "a
 TEXTS_NO_NUMBER = ("", "x", "True", "None", "0x10", "1,5", "٣x", "🚀", LONG, "a\0b")
 WHOLE = (*TEXTS_NO_NUMBER, "1.5", "1e3", "nan", "inf", "-1", "9" * 400, "9" * 5000)
 POSITIVE_WHOLE = (*WHOLE, "0", "1000000000000")
+# No flight stays a number beyond.
+BOUND = ("1e7", "1e300")
 NUMBER = (*TEXTS_NO_NUMBER, "nan", "inf", "-inf", "1e400", "-1")
 POSITIVE = (*NUMBER, "0", "-0.0")
 
@@ -78,7 +80,9 @@ BENCH = {
     "--episodes": Row(POSITIVE_WHOLE),
     "--seed": Row(WHOLE),
     "--disturbance": Row(KINDS),
-    "--bound": Row(lists(NUMBER, "0.5"), idle=("cartpole --disturbance none",), good="0.5"),
+    "--bound": Row(
+        lists((*NUMBER, *BOUND), "0.5"), idle=("cartpole --disturbance none",), good="0.5"
+    ),
     "--channels": Row(NAMES),
     "--agents": Row(lists(POSITIVE_WHOLE, "3"), SPACECRAFT, CARTPOLE, "3"),
     "--preset": Row(NAMES, SPACECRAFT, CARTPOLE, "open"),
@@ -113,7 +117,7 @@ WATCH = {
     "--agents": Row(POSITIVE_WHOLE, SPACECRAFT, CARTPOLE, "3"),
     "--preset": Row(NAMES, SPACECRAFT, CARTPOLE, "open"),
     "--disturbance": Row((*NAMES, "worst")),
-    "--bound": Row(NUMBER, idle=("cartpole --disturbance none",), good="0.5"),
+    "--bound": Row((*NUMBER, *BOUND), idle=("cartpole --disturbance none",), good="0.5"),
     "--seed": Row(WHOLE),
     "--scenario": Row(READ, SPACECRAFT, CARTPOLE, "scenario.json"),
     "--safety-filter": Row(FLAG, SPACECRAFT, CARTPOLE),
@@ -138,7 +142,7 @@ CERTIFY = {
     "--metric": Row(READ),
     "--policy": Row((*NAMES, "lqr")),
     "--json": Row(WRITTEN),
-    "--bound": Row(POSITIVE),
+    "--bound": Row((*POSITIVE, *BOUND)),
     "--episodes": Row(WHOLE),
     "--seconds": Row(POSITIVE),
     "--largest": Row(FLAG, CARTPOLE, SPACECRAFT),
@@ -157,7 +161,7 @@ TRAIN = {
 ATTACK = {
     "--policy": Row((*NAMES, "random")),
     "--goal": Row(NAMES),
-    "--bound": Row(POSITIVE),
+    "--bound": Row((*POSITIVE, *BOUND)),
     "--episodes": Row(POSITIVE_WHOLE),
     "--budget": Row(POSITIVE_WHOLE),
     "--seed": Row(WHOLE),
@@ -187,7 +191,7 @@ DATA = {
     "--episodes": Row(POSITIVE_WHOLE, MINARI),
     "--seed": Row(WHOLE, MINARI),
     "--disturbance": Row((*NAMES, "worst"), MINARI),
-    "--bound": Row(NUMBER, MINARI, ("--minari --disturbance none",), "0.5"),
+    "--bound": Row((*NUMBER, *BOUND), MINARI, ("--minari --disturbance none",), "0.5"),
     "--out": Row(FOLDERS, MINARI),
 }
 ROWS = {

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.checks import (
+    check_disturbance_bound,
     check_each,
     check_fields,
     check_name,
@@ -187,7 +188,7 @@ class Training(_Ranged):
     """
 
     task: ClassVar[str] = ""
-    not_negative: ClassVar[tuple[str, ...]] = ("effort_weight", "disturbance_bound")
+    not_negative: ClassVar[tuple[str, ...]] = ("effort_weight",)
     counts: ClassVar[tuple[str, ...]] = (
         "segments",
         "segment_steps",
@@ -211,6 +212,7 @@ class Training(_Ranged):
         super().__post_init__()
         check_whole("seed", self.seed, 0, MOST_SEEDS - 1)
         check_name("disturbance", self.disturbance, OPEN_LOOP)
+        check_disturbance_bound("disturbance_bound", self.disturbance_bound)
         if self.segments >= MOST_SEGMENTS:
             raise ValueError(
                 f"segments={self.segments} must be below {MOST_SEGMENTS}; make segment_steps larger"
@@ -368,7 +370,7 @@ class SpacecraftTraining(Training):
         for name in ("final_bounds", "final_presets"):
             check_several(name, getattr(self, name), "a tuple with something in it")
         for bound in self.final_bounds:
-            check_not_negative("final_bounds", bound)
+            check_disturbance_bound("final_bounds", bound)
 
     @property
     def rows(self) -> int:

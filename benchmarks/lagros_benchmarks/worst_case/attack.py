@@ -49,7 +49,14 @@ from lagros_benchmarks.worst_case.spacecraft import (
     first_adversaries,
 )
 from lagros_envs import cartpole_task, spacecraft_task
-from lagros_envs.checks import check_fields, check_name, check_positive, check_seed, check_whole
+from lagros_envs.checks import (
+    check_disturbance_bound,
+    check_fields,
+    check_name,
+    check_positive,
+    check_seed,
+    check_whole,
+)
 from lagros_envs.disturbances import Disturbance
 from lagros_envs.reading import Record
 from lagros_envs.scenarios import MOST_AGENTS, PRESETS
@@ -111,6 +118,7 @@ class AttackSettings:
         check_name("goal", self.goal, GOALS)
         check_name("preset", self.preset, PRESETS)
         check_positive("bound", self.bound)
+        check_disturbance_bound("bound", self.bound)
         check_whole("episodes", self.episodes, 1, MOST)
         check_whole("agents", self.agents, 1, MOST_AGENTS)
         check_seed(self.seed)
