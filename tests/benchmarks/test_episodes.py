@@ -180,3 +180,19 @@ def test_an_exception_after_a_success_is_a_failure_all_the_same(env):
     assert record.success_time is None
     assert not record.strict_success
     assert record.left_paper_tube
+
+
+def test_what_is_counted_by_the_clock_makes_no_difference(env):
+    class Late(LinearPolicy):
+        def counters(self, state):
+            return {"plans": 3, "late_plans": self.late}
+
+    nominal = nominal_of(env, 3)
+    records = []
+    for late in (0, 2):
+        policy = Late()
+        policy.late = late
+        records.append(run_episode(env, policy, 3, nominal))
+    one, two = records
+    assert one == two
+    assert (one.counters, two.timed_counters) == ({"plans": 3}, {"late_plans": 2})

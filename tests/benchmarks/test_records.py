@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
@@ -150,3 +151,16 @@ def test_no_plan_at_all_leaves_the_curves_empty():
     assert row["mean_tracking_error"] is None
     assert row["tracking_error_mean_below_tube"] is False
     assert row["success_rate"] > 0.0
+
+
+def test_all_that_a_policy_counts_is_written(run, rows):
+    timed = {
+        case: [dataclasses.replace(one, timed_counters={"late_plans": 2}) for one in records]
+        for case, records in run.episodes.items()
+    }
+    late = dataclasses.replace(run, episodes=timed)
+    for row, before in zip(summarise(late, ["here"]), rows, strict=True):
+        expected = {**before["counters"], "late_plans": 2 * before["episodes"]}
+        assert row["counters"] == expected
+    assert all(one["counters"]["late_plans"] == 2 for one in episode_objects(late))
+    assert not any("timed_counters" in one for one in episode_objects(late))

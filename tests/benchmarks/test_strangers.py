@@ -10,9 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from lagros_benchmarks import cli
+from lagros_benchmarks.calibration import cartpole_scores
 from lagros_benchmarks.flying import AnswerError, Attempt, ask, describe_error
 from lagros_benchmarks.runner import run_benchmark
 from lagros_benchmarks.settings import BenchmarkSettings
+from lagros_benchmarks.worst_case.cartpole import GOALS, draw_episodes, fly, policy_law, scores
+from lagros_policies.expert import CartPoleExpert
 from tests.benchmarks import strangers
 
 PLACE = "tests.benchmarks.strangers"
@@ -184,3 +187,27 @@ def test_an_answer_is_a_copy_of_the_right_shape():
     assert not answer.action.any()
     with pytest.raises(AnswerError, match=r"by an action of shape \(2, 8\); it must be \(3, 8\)"):
         ask(policy, seen, None, [True, True], (3, 8))
+
+
+@pytest.mark.parametrize("kind", [strangers.Raises, strangers.Leaves, strangers.NotANumber])
+def test_a_calibration_counts_what_raises_as_infinitely_far(kind):
+    found = cartpole_scores(name_of(kind), 3)
+    assert found.failed == 3
+    assert all(np.isinf(values).all() for values in found.values.values())
+
+
+def test_a_search_finds_what_makes_a_policy_raise():
+    episodes = draw_episodes(CartPoleExpert(), [1, 2, 3])
+
+    class Picky(strangers.Calm):
+        def answer(self, seen, zero):
+            if (seen[:, 4] == np.float32(episodes.goals[1, 0])).any():
+                raise ArithmeticError("not this goal")
+            return zero, None
+
+    law = policy_law(Picky(None), episodes)
+    every = np.arange(3)
+    flown = fly(episodes, law, every, np.zeros((3, episodes.settings.steps, 4)))
+    assert np.isnan(flown.forces).any(axis=(1, 2)).tolist() == [False, True, False]
+    for goal in GOALS:
+        assert np.isinf(scores(episodes, goal, every, flown)[0]).tolist() == [False, True, False]
