@@ -28,6 +28,8 @@ def ran(tmp_path_factory):
         text=True,
         check=True,
         cwd=ROOT,
+        # Libraries with threads of their own do not like to be forked.
+        env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
     )
     lines = [json.loads(line) for line in ended.stdout.splitlines()]
     return folder, {(line["name"], line["condition"]): line for line in lines}
