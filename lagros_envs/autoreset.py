@@ -247,8 +247,9 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
             worlds: Which worlds.
             zeroed: Rewards and ends of the step, the worlds first; false there from now on.
         """
+        some = np.flatnonzero(worlds)
         for array in zeroed:
-            array[worlds] = 0
+            array[some] = 0
         self._begin_unasked(worlds)
 
     def _after_step(self, ended: BoolArray) -> tuple[Float32Array, dict[str, Any]]:

@@ -25,7 +25,8 @@ from lagros_envs.conventions import (
 from lagros_envs.disturbances import Disturbance, Situation, channel_mask
 from lagros_envs.dynamics.held import HeldStep
 from lagros_envs.options import checked_actions, known_options
-from lagros_envs.seeding import episode_streams
+from lagros_envs.seeding import SharedStreams, episode_streams
+from lagros_envs.stepwise import StepwiseDisturbance
 
 FloatArray = NDArray[np.float64]
 
@@ -116,7 +117,9 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
             compiled,
             measure=task.StepMeasure(self.settings),
             given=task.STATE_DIM,
+            pushed=disturbance != "none",
         )
+        self._calm = disturbance == "none"
         self._steps = self.settings.steps
         # r(t) at every control instant.
         self._radii: list[float] = [self._radius(step) for step in range(self._steps + 1)]
@@ -124,6 +127,10 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
             disturbance, disturbance_bound, channel_mask(disturbance_channels, task.RATES), metric
         )
         self._feedback = self.disturbance.is_feedback
+        # Drawn in advance if the episode has a seed of its own.
+        self._pushes: FloatArray | None = None
+        self._stepwise = StepwiseDisturbance(self.disturbance, 1, self.settings.control_period)
+        self._shared: SharedStreams | None = None
         self.named_space = task.named_space(self.settings)
         self.observation_space = cast(
             "spaces.Space[NDArray[np.float32]]", spaces.flatten_space(self.named_space)
@@ -139,7 +146,8 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         """Start an episode.
 
         Args:
-            seed: Seed of the episode; the scenario and the disturbance have a stream each.
+            seed: Seed of the episode; the scenario and the disturbance have a stream each. None
+                goes on drawing from the generator that the last seed has left.
             options: `initial_state` (4,), `goal` (4,) or p_f, `nominal` (steps + 1, 4).
 
         Returns:
@@ -158,15 +166,9 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
             )
         seed = plain_seed(seed)
         super().reset(seed=seed)
-        if seed is None:
-            seed = int(self.np_random.integers(2**63))
-        streams = episode_streams(seed)
-        drawn = task.sample_scenario(streams.scenario, self.settings)
-        self.scenario = replace(drawn, **given)
+        drawn = self._draw(seed)
+        self.scenario = replace(drawn, **given) if given else drawn
         self.nominal = nominal
-        self._pushes = self.disturbance.realise(
-            streams.disturbance, self._steps, self.settings.control_period
-        )
         self._state: tuple[float, ...] = tuple(self.scenario.initial_state.tolist())
         self._goal: tuple[float, ...] = tuple(self.scenario.goal.tolist())
         # What stays the same in every observation of the episode.
@@ -262,6 +264,24 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
             self._renderer.close()
             self._renderer = None
 
+    def _draw(self, seed: int | None) -> task.CartPoleScenario:
+        """Draw the disturbance of an episode and return its scenario."""
+        disturbed = not self._calm
+        if seed is not None:
+            streams = episode_streams(seed)
+            if disturbed:
+                self._pushes = self.disturbance.realise(
+                    streams.disturbance, self._steps, self.settings.control_period
+                )
+            return task.sample_scenario(streams.scenario, self.settings)
+        if self._shared is None or self._shared.source is not self.np_random:
+            self._shared = SharedStreams(self.np_random)
+        if disturbed:
+            # Not in advance: an episode of a learner may end after a few steps.
+            self._pushes = None
+            self._stepwise.begin(np.zeros(1, np.intp), self._shared.disturbance)
+        return task.sample_scenario(self._shared.scenario, self.settings)
+
     def _force(self, action: NDArray[np.float32]) -> float:
         if type(action) is np.ndarray and action.shape == (1,) and action.dtype.kind == "f":
             value = action.item()
@@ -282,15 +302,17 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         """
         # By name: starred arguments would go through a list and a tuple.
         x0, x1, x2, x3 = self._state
-        d0, d1, d2, d3 = self._push.tolist()
         g0, g1, g2, g3 = self._goal
         try:
-            p, angle, velocity, rate, distance, effort, reward = self._hold.run(
-                x0, x1, x2, x3, force, d0, d1, d2, d3, g0, g1, g2, g3
-            )
+            if self._calm:
+                results = self._hold.run(x0, x1, x2, x3, force, g0, g1, g2, g3)
+            else:
+                d0, d1, d2, d3 = self._push.tolist()
+                results = self._hold.run(x0, x1, x2, x3, force, d0, d1, d2, d3, g0, g1, g2, g3)
         except (OverflowError, ValueError):  # an infinity has no sine
             pass
         else:
+            p, angle, velocity, rate, distance, effort, reward = results
             # A comparison with nan is false.
             if distance <= task.LARGEST_DISTANCE:
                 self._state = p, angle, velocity, rate
@@ -307,9 +329,15 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         return radius
 
     def _current_push(self) -> FloatArray:
-        # Past the time limit (a caller who ignored `truncated`) the last push stays.
-        index = self._step if self._step < self._steps else self._steps - 1
-        drawn: FloatArray = self._pushes[index]
+        if self._calm:
+            return np.zeros(task.STATE_DIM)
+        if self._pushes is None:
+            drawn = self._stepwise.step(self._step, cast(SharedStreams, self._shared).disturbance)[
+                :, 0
+            ]
+        else:
+            # Past the time limit (a caller who ignored `truncated`) the last push stays.
+            drawn = self._pushes[min(self._step, self._steps - 1)]
         if not self._feedback:
             return drawn
         nominal = None if self.nominal is None else self.nominal[self._nominal_index()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -32,8 +32,22 @@ _EFFORT, _EFFORT_TO_SUCCESS, _SUCCESS_TIME, _DISTANCE, _NOW, _RADIUS = range(8, 
 _ROWS = 14
 # Rows of its flags: no success so far, inside the tube now, fallen.
 _OPEN, _INSIDE, _FALLEN = range(3)
-# Start and goal in an observation, which stay the same for an episode.
-_BLANK = slice(task.GOAL.start, task.INITIAL_STATE.stop)
+# Starts that are drawn in advance.
+_READY = 2048
+
+
+class _Starts(NamedTuple):
+    """What is kept of some episodes at their start: one column of the first two, row of the last.
+
+    Attributes:
+        kept: Shape (_ROWS, episodes).
+        flags: Shape (3, episodes).
+        blank: Their observations but for state and time, shape (episodes, 13).
+    """
+
+    kept: FloatArray
+    flags: BoolArray
+    blank: NDArray[np.float32]
 
 
 class CartPoleVectorEnv(RestartingVectorEnv):
@@ -110,6 +124,7 @@ class CartPoleVectorEnv(RestartingVectorEnv):
             compiled,
             measure=task.StepMeasure(self.settings),
             given=task.STATE_DIM,
+            pushed=disturbance != "none",
         )
         self.compiled = self._hold.compiled
         self._allocate()
@@ -133,6 +148,9 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         # What stays the same in every observation of an episode: goal and initial state.
         self._blank = np.zeros((worlds, task.OBSERVATION_DIM), np.float32)
         self.nominal: FloatArray | None = None
+        self._ready = self._starts(np.zeros((0, 2)), {})
+        self._source: np.random.Generator | None = None
+        self._taken = 0
 
     def step(
         self, actions: NDArray[np.float32]
@@ -153,15 +171,11 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         self._need_start()
         force = self._force(actions)
         restarting = self._restarting()
-        if restarting is not None:
-            force[restarting] = 0.0
         effort, rewards = self._advance(force)
         first_success, fallen = self._note_arrivals(), self._flags[_FALLEN]
-        eventful = np.flatnonzero(first_success | fallen)
-        if eventful.size:
-            parts = effort, self._kept[_DISTANCE], first_success, fallen
-            chosen = (part.take(eventful) for part in parts)
-            rewards[eventful] = task.reward(self.settings, *chosen)
+        if np.count_nonzero(fallen) or np.count_nonzero(first_success):
+            distance = self._kept[_DISTANCE]
+            rewards = task.reward(self.settings, effort, distance, first_success, fallen)
         terminated = fallen.copy()
         truncated = self._step >= self.step_limit
         if restarting is not None:
@@ -196,44 +210,68 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         self.nominal = nominal_after(self.nominal, mask, None)
 
     def _start(self, worlds: IntArray, seeds: Sequence[int] | None, given: dict[str, Any]) -> None:
-        shares = self._draw(worlds, seeds)
         stated = {name: value[worlds] for name, value in given.get("scenario", {}).items()}
-        scenario = replace(task.scenario_of_shares(shares, self.settings), **stated)
-        begun = np.zeros((_ROWS, worlds.size))
-        begun[_STATE], begun[_GOAL] = scenario.initial_state.T, scenario.goal.T
-        begun[_DISTANCE] = task.goal_distance(begun[_STATE], begun[_GOAL], np.sqrt)
-        begun[_RADIUS] = self._radii[0]
-        there = begun[_DISTANCE] <= self._radii[0]
-        begun[_SUCCESS_TIME] = np.where(there, 0.0, np.inf)
-        flags = np.zeros((3, worlds.size), bool)
-        flags[_OPEN], flags[_INSIDE] = ~there, there
-        self._kept[:, worlds], self._flags[:, worlds] = begun, flags
-        self._step[worlds] = 0
-        if self.disturbance.kind != "none":
-            self._push[:, worlds] = 0.0
-        self._blank[worlds, _BLANK] = np.concatenate([begun[_GOAL], begun[_STATE]]).T
-
-    def _draw(self, worlds: IntArray, seeds: Sequence[int] | None) -> FloatArray:
-        """Draw scenario and disturbance of the episodes, and return the shares of the scenarios."""
         disturbed = self.disturbance.kind != "none"
         if seeds is None:
-            shared = self._shared
+            begun = self._drawn_starts(worlds.size, stated)
             if disturbed:
                 self._in_advance[worlds] = False
-                self._stepwise.begin(worlds, shared.disturbance)
-            return task.draw_shares(shared.scenario, worlds.shape)
+                self._stepwise.begin(worlds, self._shared.disturbance)
+        else:
+            begun = self._seeded_starts(seeds, stated)
+            if disturbed:
+                self._realise(worlds, seeds)
+        self._kept[:, worlds], self._flags[:, worlds] = begun.kept, begun.flags
+        self._blank[worlds] = begun.blank
+        self._step[worlds] = 0
         if disturbed:
-            if self._pushes is None:
-                self._pushes = np.zeros((self.num_envs, self._steps, task.STATE_DIM))
-            pushes = np.empty((worlds.size, *self._pushes.shape[1:]))
-            streams = seeded_streams(seeds, "disturbance")
-            self.disturbance.realise_all(streams, pushes, self.settings.control_period)
-            self._pushes[worlds] = pushes
-            self._in_advance[worlds] = True
-        shares = np.empty((worlds.size, 2))
+            self._push[:, worlds] = 0.0
+
+    def _seeded_starts(self, seeds: Sequence[int], stated: dict[str, FloatArray]) -> _Starts:
+        shares = np.empty((len(seeds), 2))
         for row, rng in zip(shares, seeded_streams(seeds, "scenario"), strict=True):
             row[:] = task.draw_shares(rng)
-        return shares
+        return self._starts(shares, stated)
+
+    def _drawn_starts(self, count: int, stated: dict[str, FloatArray]) -> _Starts:
+        """Return starts of episodes without seeds, as far as they are not stated.
+
+        Some are drawn and worked out in advance: that takes as long for a thousand as for ten.
+        """
+        rng = self._shared.scenario
+        if stated:
+            return self._starts(task.draw_shares(rng, (count,)), stated)
+        if rng is not self._source or self._taken + count > len(self._ready.blank):
+            drawn = task.draw_shares(rng, (max(_READY, count),))
+            self._source, self._ready, self._taken = rng, self._starts(drawn, {}), 0
+        some = slice(self._taken, self._taken + count)
+        self._taken += count
+        kept, flags, blank = self._ready
+        return _Starts(kept[:, some], flags[:, some], blank[some])
+
+    def _starts(self, shares: FloatArray, stated: dict[str, FloatArray]) -> _Starts:
+        """Return what is kept of episodes at their start."""
+        scenario = replace(task.scenario_of_shares(shares, self.settings), **stated)
+        kept = np.zeros((_ROWS, len(shares)))
+        kept[_STATE], kept[_GOAL] = scenario.initial_state.T, scenario.goal.T
+        kept[_DISTANCE] = task.goal_distance(kept[_STATE], kept[_GOAL], np.sqrt)
+        kept[_RADIUS] = self._radii[0]
+        there = kept[_DISTANCE] <= self._radii[0]
+        kept[_SUCCESS_TIME] = np.where(there, 0.0, np.inf)
+        flags = np.stack([~there, there, np.zeros_like(there)])
+        blank = np.zeros((len(shares), task.OBSERVATION_DIM), np.float32)
+        blank[:, task.GOAL], blank[:, task.INITIAL_STATE] = scenario.goal, scenario.initial_state
+        return _Starts(kept, flags, blank)
+
+    def _realise(self, worlds: IntArray, seeds: Sequence[int]) -> None:
+        """Draw the disturbances of episodes with seeds."""
+        if self._pushes is None:
+            self._pushes = np.zeros((self.num_envs, self._steps, task.STATE_DIM))
+        pushes = np.empty((worlds.size, *self._pushes.shape[1:]))
+        streams = seeded_streams(seeds, "disturbance")
+        self.disturbance.realise_all(streams, pushes, self.settings.control_period)
+        self._pushes[worlds] = pushes
+        self._in_advance[worlds] = True
 
     def _advance(self, force: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Move all worlds over one control step.
@@ -282,9 +320,17 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         return stored if drawn is None else np.where(advance, stored, drawn)
 
     def _force(self, actions: NDArray[np.float32]) -> FloatArray:
-        values = checked_actions(actions, (self.num_envs, 1), "the force of each world")[:, 0]
+        if type(actions) is np.ndarray and actions.dtype == np.float32:
+            # What single precision holds does not overflow on its way to a force.
+            usual = actions.shape == (self.num_envs, 1)
+            if usual and np.count_nonzero(np.isfinite(actions)) == actions.size:
+                return self._applied(actions[:, 0].astype(np.float64))
+        values = checked_actions(actions, (self.num_envs, 1), "the force of each world")
         with np.errstate(over="ignore"):
-            force: FloatArray = task.applied_force(self.settings, values, np.clip)
+            return self._applied(values[:, 0])
+
+    def _applied(self, values: FloatArray) -> FloatArray:
+        force: FloatArray = task.applied_force(self.settings, values, np.clip)
         return force
 
     def _clock(self) -> tuple[FloatArray, FloatArray]:
@@ -322,20 +368,24 @@ class CartPoleVectorEnv(RestartingVectorEnv):
 
     def _info(self) -> dict[str, Any]:
         # Copies: what is kept is written to.
-        kept, flags = self._kept.copy(), self._flags.copy()
+        kept, flags = self._kept[_EFFORT:].copy(), self._flags.copy()
+        effort, effort_to_success, success_time, distance, _, radius = kept
+        calm = self.disturbance.kind == "none"
         info = {
             "success": ~flags[_OPEN],
             "is_success": ~flags[_OPEN],
-            "success_time": kept[_SUCCESS_TIME],
+            "success_time": success_time,
             "inside_tube": flags[_INSIDE],
             "fallen": flags[_FALLEN],
-            "effort": kept[_EFFORT],
-            "effort_to_success": kept[_EFFORT_TO_SUCCESS],
-            "disturbance": np.array(self._push.T, order="C"),
-            "tube_radius": kept[_RADIUS],
-            "goal_distance": kept[_DISTANCE],
+            "effort": effort,
+            "effort_to_success": effort_to_success,
+            "disturbance": np.zeros(self._push.T.shape)
+            if calm
+            else np.array(self._push.T, order="C"),
+            "tube_radius": radius,
+            "goal_distance": distance,
         }
         nominal = self._nominal_now()
         if nominal is not None:
-            info["tracking_error"] = task.goal_distance(kept[_STATE], nominal.T, np.sqrt)
+            info["tracking_error"] = task.goal_distance(self._kept[_STATE], nominal.T, np.sqrt)
         return info

@@ -75,7 +75,10 @@ class SpacecraftWorld:
         self.step_limit = settings.steps
         shape = (worlds, agents)
         substep = settings.control_period / SUBSTEPS
-        self._hold = HeldBatch(settings.system.by_wrench, substep, shape, compiled, 1)
+        pushed = disturbance.kind != "none"
+        self._hold = HeldBatch(
+            settings.system.by_wrench, substep, shape, compiled, 1, pushed=pushed
+        )
         self.compiled = self._hold.compiled
         self.parts = np.zeros((task.STATE_DIM, *shape))
         self.goals = np.zeros((2, *shape))

@@ -88,6 +88,7 @@ class CompiledBatch:
         substeps: Runge-Kutta steps in the step.
         measure: As in `recorded_hold`.
         given: As in `recorded_hold`.
+        pushed: As in `recorded_hold`.
 
     Attributes:
         inputs: x, u, d and what is given, to be filled in before a call, shape (inputs, *shape).
@@ -106,10 +107,11 @@ class CompiledBatch:
         substeps: int,
         measure: Measure | None = None,
         given: int = 0,
+        pushed: bool = True,
     ) -> None:
         """Compile the step, or load it, and allocate its inputs."""
         n = system.state_dim
-        step = recorded_hold(system, duration / substeps, 1, VectorFunctions)
+        step = recorded_hold(system, duration / substeps, 1, VectorFunctions, pushed=pushed)
         tail = recorded_measure(system, measure, given, VectorFunctions) if measure else None
         inputs = len(step.inputs) + given
         size = math.prod(shape)

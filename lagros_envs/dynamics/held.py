@@ -34,11 +34,12 @@ class HeldStep:
         compiled: Whether numba compiles it.
         measure: Computes more from the state at the end, see `straight_line.recorded_hold`.
         given: How many numbers the measure is given.
+        pushed: Whether there is a disturbance; it costs a tenth of the step.
 
     Attributes:
-        run: From the n parts of x, the m of u, the n of d and what is given to the n of x at the
-            end and what the measure computed. It raises ValueError for the sine of an infinity, or
-            returns nan where it is compiled.
+        run: From the n parts of x, the m of u, the n of d (if there is one) and what is given to
+            the n of x at the end and what the measure computed. It raises ValueError for the sine
+            of an infinity, or returns nan where it is compiled.
 
     Raises:
         ImportError: `compiled` was asked for and numba is not installed.
@@ -51,11 +52,12 @@ class HeldStep:
         compiled: bool = False,
         measure: Measure | None = None,
         given: int = 0,
+        pushed: bool = True,
     ) -> None:
         """Record the step."""
-        self._made_from = system, duration, compiled, measure, given
+        self._made_from = system, duration, compiled, measure, given, pushed
         self.run: FloatStep = _float_step(
-            cast(Hashable, system), duration, compiled, cast(Hashable, measure), given
+            cast(Hashable, system), duration, compiled, cast(Hashable, measure), given, pushed
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -77,6 +79,7 @@ class HeldBatch:
         substeps: Runge-Kutta steps in the step.
         measure: Computes more from the state at the end, see `straight_line.recorded_hold`.
         given: Number of arrays that the measure is given.
+        pushed: As in `HeldStep`.
 
     Attributes:
         compiled: Whether it is compiled.
@@ -95,21 +98,24 @@ class HeldBatch:
         substeps: int = SUBSTEPS,
         measure: Measure | None = None,
         given: int = 0,
+        pushed: bool = True,
     ) -> None:
         """Record the step and allocate its buffers."""
-        self._made_from = system, duration, shape, compiled, substeps, measure, given
+        self._made_from = system, duration, shape, compiled, substeps, measure, given, pushed
         n, m = system.state_dim, system.control_dim
-        self._ends = n, n + m, n + m + n
+        self._ends = n, n + m, n + m + (n if pushed else 0)
         self._run: Callable[[], Any]
         self.compiled = has_numba() if compiled is None else compiled
         if self.compiled:
             from lagros_envs.dynamics.compiled import CompiledBatch
 
-            batch = CompiledBatch(system, duration, shape, substeps, measure, given)
+            batch = CompiledBatch(system, duration, shape, substeps, measure, given, pushed)
             self._run, self._inputs = batch, batch.inputs
             self._states, self.measured = batch.states, batch.measured
         else:
-            step = recorded_hold(system, duration, substeps, measure=measure, given=given)
+            step = recorded_hold(
+                system, duration, substeps, measure=measure, given=given, pushed=pushed
+            )
             function = ArrayFunction(step, shape)
             # An enormous force overflows; the environments look at what comes out.
             self._run = np.errstate(over="ignore", invalid="ignore")(function)
@@ -120,7 +126,7 @@ class HeldBatch:
         self,
         state: FloatArray | Sequence[FloatArray],
         control: FloatArray | Sequence[FloatArray],
-        push: FloatArray | Sequence[FloatArray],
+        push: FloatArray | Sequence[FloatArray] = (),
         given: FloatArray | Sequence[FloatArray] = (),
     ) -> FloatArray:
         """Advance the batch.
@@ -128,7 +134,8 @@ class HeldBatch:
         Args:
             state: x, one array of the batch's shape for each coordinate.
             control: u, the same for each control.
-            push: d, the same for each coordinate, in units of the state per second.
+            push: d, the same for each coordinate, in units of the state per second; not looked at
+                where there is none.
             given: What the measure is given.
 
         Returns:
@@ -138,7 +145,8 @@ class HeldBatch:
         inputs = self._inputs
         inputs[:first] = state
         inputs[first:second] = control
-        inputs[second:third] = push
+        if third > second:
+            inputs[second:third] = push
         if len(given):
             inputs[third:] = given
         self._run()
@@ -167,10 +175,11 @@ def has_numba() -> bool:
 
 @lru_cache(maxsize=32)
 def _float_step(
-    system: Any, duration: float, compiled: bool, measure: Any, given: int
+    system: Any, duration: float, compiled: bool, measure: Any, given: int, pushed: bool
 ) -> FloatStep:
     tail = None if measure is None else recorded_measure(system, measure, given)
-    source = scalar_source(recorded_hold(system, duration / SUBSTEPS, 1), SUBSTEPS, tail)
+    step = recorded_hold(system, duration / SUBSTEPS, 1, pushed=pushed)
+    source = scalar_source(step, SUBSTEPS, tail)
     if compiled:
         from lagros_envs.dynamics.compiled import compiled_function
 

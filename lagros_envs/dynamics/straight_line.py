@@ -98,6 +98,7 @@ def recorded_hold(
     functions: Any = elementary,
     measure: Measure | None = None,
     given: int = 0,
+    pushed: bool = True,
 ) -> StraightLine:
     """Record `rk4_hold` of a system: inputs x0..., u0..., d0..., outputs the state at the end.
 
@@ -108,20 +109,23 @@ def recorded_hold(
         functions: Elementary functions of recorded numbers.
         measure: Computes further outputs from the state at the end.
         given: Number of further inputs g0..., which only the measure sees.
+        pushed: Whether there are disturbances d0... at all.
 
     Returns:
         The operations of the step.
     """
     n, m = system.state_dim, system.control_dim
-    sizes = {"x": n, "u": m, "d": n, "g": given}
+    pushes = n if pushed else 0
+    sizes = {"x": n, "u": m, "d": pushes, "g": given}
     names = [f"{kind}{k}" for kind, count in sizes.items() for k in range(count)]
 
     def hold(numbers: Sequence[Recorded]) -> Sequence[Any]:
-        state, control, push = numbers[:n], numbers[n : n + m], numbers[n + m : n + m + n]
+        state, control = numbers[:n], numbers[n : n + m]
+        push = numbers[n + m : n + m + n] if pushed else [-0.0] * n
         end = rk4_hold(system, state, control, push, duration, functions, substeps)
         if measure is None:
             return end
-        return [*end, *measure(end, control, numbers[n + m + n :], functions)]
+        return [*end, *measure(end, control, numbers[n + m + pushes :], functions)]
 
     return straight_line(hold, names)
 

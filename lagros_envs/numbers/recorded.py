@@ -20,6 +20,9 @@ class Operation(NamedTuple):
     operands: tuple[str, ...]
 
 
+_NEUTRAL = {"*": "1.0", "+": "-0.0"}
+
+
 class Tape:
     """Operations in the order in which they were recorded, equal ones only once."""
 
@@ -31,14 +34,17 @@ class Tape:
     def record(self, symbol: str, *operands: Any) -> Recorded:
         """Note an operation and return its result; a product with one is the other factor.
 
+        So is a sum with -0.0, which changes no bit of anything. (A sum with 0.0 would.)
+
         Raises:
             TypeError: An operand is neither a `Recorded` nor a finite number.
         """
-        if symbol == "*" and "1.0" in map(operand_text, operands):
+        neutral = _NEUTRAL.get(symbol, "")
+        if neutral in map(operand_text, operands):
             first, second = operands
-            factor = second if operand_text(first) == "1.0" else first
-            if isinstance(factor, Recorded):
-                return factor
+            other = second if operand_text(first) == neutral else first
+            if isinstance(other, Recorded):
+                return other
         operation = Operation(symbol, tuple(map(operand_text, operands)))
         if operation not in self._known:
             self._known[operation] = Recorded(self, f"%{len(self.operations)}")
