@@ -1,18 +1,13 @@
 """Recorded steps compiled by numba, which is an optional dependency (the extra "fast").
 
-What is compiled is kept in the user's cache folder and found there by the next process. The file's
-name is the hash of the source, so that no change of the physics meets an older result.
+Each process compiles for itself, which takes a second: what numba keeps on disk are pickles, and
+this package reads none.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
-import os
-import sys
 from functools import lru_cache
-from pathlib import Path
-from types import ModuleType
 from typing import Any, cast
 
 import numpy as np
@@ -28,7 +23,6 @@ from lagros_envs.dynamics.straight_line import (
     statements,
 )
 from lagros_envs.dynamics.system import System
-from lagros_envs.files import write_atomic
 from lagros_envs.numbers import Recorded, functions
 from lagros_envs.numbers.recorded import Operation
 
@@ -109,7 +103,7 @@ class CompiledBatch:
         given: int = 0,
         pushed: bool = True,
     ) -> None:
-        """Compile the step, or load it, and allocate its inputs."""
+        """Write the step, which its first call compiles, and allocate its inputs."""
         n = system.state_dim
         step = recorded_hold(system, duration / substeps, 1, VectorFunctions, pushed=pushed)
         tail = recorded_measure(system, measure, given, VectorFunctions) if measure else None
@@ -137,7 +131,7 @@ def compiled_function(source: str, fuse: bool = False) -> Any:
             quotient a product.
 
     Returns:
-        numba's dispatcher; it compiles, or loads, at its first call.
+        numba's dispatcher; it compiles at its first call.
 
     Raises:
         ImportError: numba is not installed.
@@ -148,19 +142,12 @@ def compiled_function(source: str, fuse: bool = False) -> Any:
         raise ImportError(
             'compiled=True needs numba, which is not installed: pip install "lagros[fast]"'
         ) from error
-    name = f"lagros_held_{hashlib.sha256(source.encode()).hexdigest()[:24]}"
-    path = _kept_source(name, source)
-    module = ModuleType(name)
-    # numba looks there for the globals of a function that it has found in its cache.
-    sys.modules[name] = module
-    exec(compile(source, path or name, "exec"), module.__dict__)
+    # Our own text: operators, the names of the inputs, and the numbers of the system.
+    namespace: dict[str, Any] = {}
+    exec(compile(source, "<held step>", "exec"), namespace)
     # "numpy": a division by zero is an infinity, not a branch that keeps loops from vectorising.
-    decorate = numba.njit(
-        cache=path is not None,
-        error_model="numpy",
-        fastmath={"arcp", "contract"} if fuse else False,
-    )
-    return decorate(module.held)
+    decorate = numba.njit(error_model="numpy", fastmath={"arcp", "contract"} if fuse else False)
+    return decorate(namespace["held"])
 
 
 def batch_source(
@@ -285,15 +272,3 @@ def _polynomial(x: Any, coefficients: list[float]) -> Any:
     square = x * x
     even = _polynomial(square, coefficients[0::2])
     return even + x * _polynomial(square, coefficients[1::2])
-
-
-def _kept_source(name: str, source: str) -> str | None:
-    """Write the source to the cache folder and return its path, or None if that cannot be."""
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lagros"
-    path = folder / f"{name}.py"
-    try:
-        if not path.is_file() or path.read_text(encoding="utf-8") != source:
-            write_atomic(path, source)
-    except OSError:
-        return None
-    return str(path)
