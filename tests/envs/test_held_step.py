@@ -255,6 +255,8 @@ def test_threads_may_compile_at_once():
     assert found == [2.5, 3.5, 4.5, 5.5]
 
 
+# The episode goes on after the force that nothing stands under.
+@pytest.mark.filterwarnings("ignore:.*even though this environment has already")
 @needs_numba
 @pytest.mark.parametrize("kind", ["none", "gust"])
 def test_a_compiled_environment_flies_the_same_episode(kind, hold):
