@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 from lagros_benchmarks import cartpole_tables, spacecraft_tables
@@ -191,11 +191,26 @@ def markdown_text(rows: Sequence[Row]) -> str:
         ordered = _texts(group[0]).ordered(group)
         contents = [[content(row).strip() for _, _, content in shown] for row in ordered]
         blocks.append(markdown_table(units, contents))
-        heading, *lines = [*comparison_lines(group)] or [""]
-        if lines:
-            blocks += [heading, "\n".join(f"- {line.strip()}" for line in lines)]
+        blocks += _markdown_lines(comparison_lines(group))
         blocks += raised_lines(group)
     return "\n\n".join(blocks) + "\n"
+
+
+def _markdown_lines(lines: Iterable[str]) -> Iterator[str]:
+    """Yield headings and the lists below them; what is indented twice goes on with its line."""
+    items: list[str] = []
+    for line in lines:
+        if line.startswith("    ") and items:
+            items[-1] += f" {line.strip()}"
+        elif line.startswith(" "):
+            items.append(f"- {line.strip()}")
+        else:
+            if items:
+                yield "\n".join(items)
+            items = []
+            yield line
+    if items:
+        yield "\n".join(items)
 
 
 def _escape(text: str) -> str:

@@ -321,3 +321,13 @@ def test_bench_prints_the_tables_and_writes_the_files(invoke, tmp_path):
         for policy in ("tube-mpc", "centralized")
     ]
     assert {row["seed"] for row in rows} == {5}
+
+
+def test_headings_below_a_markdown_table_are_no_entries_of_lists(sweep):
+    blocks = tables.markdown_text([row for row in sweep if row["bound"] == 0.2]).split("\n\n")
+    for heading in ("On the same agents, with", "On the same agents, without", "What the filter"):
+        at = next(at for at, block in enumerate(blocks) if block.startswith(f"{heading}"))
+        assert blocks[at].endswith("; effort ratio where both succeed:")
+        lines = blocks[at + 1].splitlines()
+        assert len(lines) == (4 if heading.startswith("What") else 3)
+        assert all(line.startswith("- (") or "raising" in line for line in lines)
