@@ -105,7 +105,7 @@ def check_trained_for(
     if allow_other_settings:
         return
     for name, value in _flown(flown).items():
-        needed = _needed(_range_of(metadata, what, assumed), name, value)
+        needed = _needed(range_of(metadata, what, assumed), name, value)
         if needed is not None:
             raise ValueError(
                 f"{name}={value!r}: {what} was made for {needed}; use what was made for this task, "
@@ -113,7 +113,12 @@ def check_trained_for(
             )
 
 
-def _range_of(metadata: Mapping[str, str], what: str, assumed: Range) -> Range:
+def range_of(metadata: Mapping[str, str], what: str, assumed: Range) -> Range:
+    """Return what a network may fly; the arguments are those of `check_trained_for`.
+
+    Raises:
+        ValueError: The metadata cannot be read.
+    """
     text = metadata.get(SETTINGS)
     if text is None:
         return assumed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -13,9 +14,11 @@ from lagros_policies.imitation.features import FEATURES, cartpole_features
 from lagros_policies.imitation.networks import Mlp
 from lagros_policies.observed import cartpole_rows
 from lagros_policies.policy import PolicyState
-from lagros_policies.trained_for import cartpole_range, check_trained_for
+from lagros_policies.trained_for import cartpole_range, check_trained_for, range_of
 
 Float32Array = NDArray[np.float32]
+# Of the features, what an episode asks for.
+_WAY, _LEAN = FEATURES.index("goal - start [m]"), FEATURES.index("initial angle [rad]")
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 
 
@@ -57,13 +60,20 @@ class NetworkPolicy:
                 f"{path} has {self.network.inputs} inputs and {self.network.outputs} outputs; "
                 f"a cart-pole network has {len(FEATURES)} and 1"
             )
+        assumed = cartpole_range(task.CartPoleSettings(), timed=True)
         check_trained_for(
             self.network.metadata,
             str(path),
             self.recorded_as,
             self.settings,
-            cartpole_range(task.CartPoleSettings(), timed=True),
+            assumed,
             allow_other_settings,
+        )
+        trained = range_of(self.network.metadata, str(path), assumed).get("at_most", {})
+        # Of single precision, a hair wider than trained for.
+        self._farthest, self._steepest = (
+            math.inf if allow_other_settings else (1.0 + 1e-6) * float(trained.get(name, math.inf))
+            for name in ("goal_range", "initial_angle")
         )
         self._unit = np.float32(1.0 / self.settings.force_scale)
 
@@ -77,11 +87,27 @@ class NetworkPolicy:
         """Evaluate the network; see `Policy.predict`.
 
         Raises:
-            ValueError: The observation is not one of the task, or not finite.
+            ValueError: The observation is not one of the task, not finite, or of an episode with a
+                goal farther away or a start that leans more than in the training.
         """
         features, side = cartpole_features(cartpole_rows(observation, np.float32))
+        self._check_scenario(features)
         force = self.network(features)
         return force * (side[..., None] * self._unit), state
+
+    def _check_scenario(self, features: Float32Array) -> None:
+        """Check the distance to the goal and the angle at the start of the episode."""
+        if features.ndim == 1:
+            way, lean = abs(features.item(_WAY)), abs(features.item(_LEAN))
+        else:
+            sizes = np.abs(features[:, [_WAY, _LEAN]])
+            way, lean = np.max(sizes, axis=0, initial=0.0).tolist()
+        if way > self._farthest or lean > self._steepest:
+            raise ValueError(
+                f"the episode goes {way:.3g} m from a lean of {lean:.3g} rad; "
+                f"{self.name} was trained for at most {self._farthest:.3g} m and "
+                f"{self._steepest:.3g} rad: pass allow_other_settings=True to fly outside of that"
+            )
 
     def bare_forward(self, features: Float32Array) -> Float32Array:
         """Evaluate the network alone, for timing: features (7,) to force (1,) [N]."""

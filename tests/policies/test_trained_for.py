@@ -233,3 +233,19 @@ def test_every_policy_takes_the_permission():
     for name in SPACECRAFT_NAMES:
         env = spacecraft_v0.parallel_env(2)
         assert make(name, env, allow_other_settings=True).name == name
+
+
+@pytest.mark.parametrize("name", ["learned", "lagros", "residual"])
+def test_a_network_flies_no_episode_that_asks_for_more_than_its_training(name):
+    env = CartPoleEnv()
+    policy = make(name, env)
+    free = make(name, env, allow_other_settings=True)
+    edge = {"initial_state": [0.0, -np.pi / 3, 0.0, 0.0], "goal": 5.0}
+    observation, _ = env.reset(options=edge)
+    assert np.array_equal(policy.predict(observation)[0], free.predict(observation)[0])
+    for more in ({"goal": 6.0}, {"goal": -40.0}, {"initial_state": [0.0, 1.1, 0.0, 0.0]}):
+        far, _ = env.reset(options=edge | more)
+        for seen in (far, np.stack([observation, far])):
+            with pytest.raises(ValueError, match=r"trained for at most 5 m and 1\.05 rad"):
+                policy.predict(seen)
+            assert np.isfinite(free.predict(seen)[0]).all()
