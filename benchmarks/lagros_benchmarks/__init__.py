@@ -1,8 +1,8 @@
 """Paired episodes, intervals, tables, figures and the command line `lagros`.
 
 `BenchmarkSettings` says what to run, `run_benchmark` runs it, with policies that are built by their
-names or are objects of your own, and `summarise` turns the episodes into the rows of the published
-tables. `lagros_benchmarks.cli` is the same from a terminal.
+names or are objects of your own (with `kept_in` it goes on where it was killed), and `summarise`
+turns the episodes into the rows of the published tables. `lagros_benchmarks.cli` is the same from a terminal.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from lagros_benchmarks.episodes import EpisodeRecord, run_episode
     from lagros_benchmarks.library import Policy
     from lagros_benchmarks.records import summarise
-    from lagros_benchmarks.runner import BenchmarkRun, run_benchmark
+    from lagros_benchmarks.runner import BenchmarkRun, kept_in, run_benchmark
     from lagros_benchmarks.settings import BenchmarkSettings
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "BenchmarkSettings",
     "EpisodeRecord",
     "Policy",
+    "kept_in",
     "run_benchmark",
     "run_episode",
     "summarise",
@@ -29,6 +30,7 @@ _HOMES = {
     "BenchmarkSettings": "settings",
     "EpisodeRecord": "episodes",
     "Policy": "library",
+    "kept_in": "runner",
     "run_benchmark": "runner",
     "run_episode": "episodes",
     "summarise": "records",

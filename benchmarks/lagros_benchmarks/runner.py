@@ -97,13 +97,15 @@ def run_benchmark(
         SetupError: A policy, the planner or the metric cannot be built, or a policy cannot run.
             (What an episode raises is recorded as its failure instead.)
         ValueError: An object has the name of a policy of this package, or comes with `kept`, which
-            cannot tell one object from another.
+            cannot tell one object from another; or `kept` is of other settings.
         BackendError: The backend is not installed, not reachable, or loses its workers.
     """
     if policies:
         if kept is not None:
             raise ValueError("kept= cannot tell policies that are objects apart; leave it out")
         settings, toolbox = _with_policies(settings, toolbox, policies)
+    if kept is not None and kept.key != fingerprint(settings, toolbox or Toolbox()):
+        raise ValueError("kept is of other settings; use kept_in(folder, settings, toolbox)")
     experiment = make_experiment(settings, toolbox)
     cases = settings.cases
     with running(settings.backend, settings.jobs):

@@ -210,6 +210,13 @@ def test_what_is_kept_is_not_run_again(tmp_path, plain, task):
     assert all(done == total for _, done, total in told)
 
 
+def test_what_is_kept_of_other_settings_is_refused(tmp_path):
+    settings, toolbox = killed_runs.RUNS["cartpole"]
+    kept = kept_in(tmp_path, settings, toolbox)
+    with pytest.raises(ValueError, match="of other settings"):
+        run_benchmark(dataclasses.replace(settings, seed=1), toolbox, kept=kept)
+
+
 def test_two_processes_may_share_a_folder(tmp_path, plain):
     code = (
         "from tests.benchmarks.killed_runs import run; import pathlib, sys; "
