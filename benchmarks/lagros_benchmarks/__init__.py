@@ -2,7 +2,8 @@
 
 `BenchmarkSettings` says what to run, `run_benchmark` runs it, with policies that are built by their
 names or are objects of your own (with `kept_in` it goes on where it was killed), and `summarise`
-turns the episodes into the rows of the published tables. `lagros_benchmarks.cli` is the same from a terminal.
+turns the episodes into the rows of the published tables. `lagros_benchmarks.cli` is the same from a
+terminal.
 """
 
 from typing import TYPE_CHECKING, Any
