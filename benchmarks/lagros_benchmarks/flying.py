@@ -111,8 +111,10 @@ def ask(
         action = _array(action)
     if action.dtype.kind not in "iuf":
         raise AnswerError(f"predict returned {_said(action)} as its action; it must be numbers")
-    with np.errstate(over="ignore"):
-        single = np.array(action, np.float32)
+    single = action
+    if action.dtype != np.float32:
+        with np.errstate(over="ignore"):  # it is then not finite, which is said below
+            single = action.astype(np.float32)
     seconds = perf_counter() - begin
     if single.shape not in shapes:
         raise AnswerError(
@@ -122,7 +124,8 @@ def ask(
     if not np.isfinite(single).all():
         at = np.flatnonzero(~np.isfinite(single.ravel()))[0]
         raise ValueError(f"predict returned an action that is not finite: {single.ravel()[at]}")
-    return Answer(single.reshape(shapes[0]), memory, seconds)
+    # A copy: the policy may go on with its own array.
+    return Answer(np.array(single).reshape(shapes[0]), memory, seconds)
 
 
 def _array(action: Any) -> NDArray[Any]:

@@ -172,9 +172,16 @@ def test_a_text_is_one_line_that_can_be_printed():
     assert len(long) < 600
 
 
+def test_a_policy_writes_into_copies():
+    seen, starts = np.zeros((2, 20)), np.ones(2, bool)
+    ask(strangers.Writes(None, preset=None), seen, None, starts, (2, 8))
+    assert not seen.any()
+    assert starts.all()
+
+
 def test_an_answer_is_a_copy_of_the_right_shape():
     class Reuses(strangers.Calm):
-        buffer = np.zeros((2, 8))
+        buffer = np.zeros((2, 8), np.float32)
 
         def answer(self, seen, zero):
             return self.buffer, None
