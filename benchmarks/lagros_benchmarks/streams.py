@@ -136,4 +136,5 @@ def _open_closed() -> None:
         try:
             os.fstat(descriptor)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)
+            # For the processes that we start, too.
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)

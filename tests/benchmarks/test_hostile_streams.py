@@ -112,3 +112,19 @@ def test_the_program_itself_ends_quietly_when_its_reader_has_gone(tmp_path):
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (1, "")
     assert os.listdir(tmp_path) == ["b.json"]
+
+
+def test_worker_processes_need_no_stream_either(tmp_path):
+    command = "-m lagros_benchmarks bench cartpole --policies random --episodes 1 --json b.json"
+    shell = ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", sys.executable, *command.split()]
+    (tmp_path / "tmp").mkdir()
+    ended = subprocess.run(
+        [*shell, "--jobs", "2"],
+        check=False,
+        cwd=tmp_path,
+        env={**os.environ, "TMPDIR": str(tmp_path / "tmp")},
+    )
+    assert ended.returncode == 1  # the table was not printed
+    assert sorted(os.listdir(tmp_path)) == ["b.json", "tmp"]
+    (kept,) = tmp_path.glob("tmp/lagros-*/printed.txt")
+    assert "random" in kept.read_text()
