@@ -59,11 +59,15 @@ class Outputs:
             ValueError: A file cannot be written, two are one, a figure has an unknown suffix, or
                 the task has no such scene.
         """
-        for path in (self.figure, self.scene):
+        for option in ("--figure", "--scene"):
+            path = self._paths[option]
             if path is not None:
                 from lagros_benchmarks.figures import check_figure_path
 
-                check_figure_path(path)
+                try:
+                    check_figure_path(path)
+                except ValueError as error:
+                    raise ValueError(f"{option}: {error}") from None
         if self.scene is not None:
             if task != "spacecraft":
                 raise ValueError(f"scene: {task} has none; leave out --scene, or take spacecraft")

@@ -31,7 +31,10 @@ Value = TypeVar("Value")
 # The command that runs.
 _CONTEXT: ContextVar[Any] = ContextVar("context", default=None)
 # How the settings begin a message on one of their fields.
-_FIELD = re.compile(r"(\w+)=|unknown ([\w ]+?) ['\"]|(\w+) must not be empty")
+_FIELD = re.compile(
+    r"(\w+)=|unknown ([\w ]+?) ['\"]|(\w+) must not be empty|(\w+) ['\"]|"
+    r"there is no (?:file|module) .+ for (?:a|the) (\w+)"
+)
 _SHOWN = 60  # letters of an entry in a message
 _LONGEST = 800  # letters of a message
 
@@ -133,8 +136,11 @@ def _named_by_option(text: str) -> str:
     said = _FIELD.match(text)
     field = next(filter(None, said.groups())) if said else ""
     for option, name in options.items():
+        if _stem(name) == _stem(field):
+            return f"{option}: {text}"
+    for option, name in options.items():
         value = context.params.get(name)
-        if _stem(name) == _stem(field) or (isinstance(value, Path) and _speaks_of(text, value)):
+        if isinstance(value, Path) and _speaks_of(text, value):
             return f"{option}: {text}"
     return text
 

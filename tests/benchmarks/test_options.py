@@ -20,6 +20,18 @@ from lagros_benchmarks import cli
 
 LONG = "x" * 100_000
 NAMES = ("", "nonsense", "None", "ünï🚀", "a b", "-", "--", LONG, "a\0b", "a\nb", "../x")
+POLICIES = (
+    *NAMES,
+    "absent.zip",
+    "sac:absent.zip",
+    "folder.zip",
+    "a:",
+    ":x",
+    "..:x",
+    "../mine:Good",
+    "a:b:c",
+    "no_module_of_that_name:Class",
+)
 TEXTS_NO_NUMBER = ("", "x", "True", "None", "0x10", "1,5", "٣x", "🚀", LONG, "a\0b")
 WHOLE = (*TEXTS_NO_NUMBER, "1.5", "1e3", "nan", "inf", "-1", "9" * 400, "9" * 5000)
 POSITIVE_WHOLE = (*WHOLE, "0", "1000000000000")
@@ -76,7 +88,7 @@ CARTPOLE, SPACECRAFT = ("cartpole",), ("spacecraft",)
 MINARI = ("--minari",)
 KINDS = lists(NAMES, "gust")
 BENCH = {
-    "--policies": Row(lists(NAMES, "lagros")),
+    "--policies": Row(lists(POLICIES, "lagros")),
     "--episodes": Row(POSITIVE_WHOLE),
     "--seed": Row(WHOLE),
     "--disturbance": Row(KINDS),
@@ -113,7 +125,7 @@ REPRODUCE = {
     "--shipped-weights": Row(FLAG),
 }
 WATCH = {
-    "--policy": Row(NAMES),
+    "--policy": Row(POLICIES),
     "--agents": Row(POSITIVE_WHOLE, SPACECRAFT, CARTPOLE, "3"),
     "--preset": Row(NAMES, SPACECRAFT, CARTPOLE, "open"),
     "--disturbance": Row((*NAMES, "worst")),
@@ -159,7 +171,7 @@ TRAIN = {
     "--figure": Row(FIGURES),
 }
 ATTACK = {
-    "--policy": Row((*NAMES, "random")),
+    "--policy": Row((*POLICIES, "random")),
     "--goal": Row(NAMES),
     "--bound": Row((*POSITIVE, *BOUND)),
     "--episodes": Row(POSITIVE_WHOLE),
