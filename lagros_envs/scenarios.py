@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import (
-    LARGEST,
     check_fields,
     check_not_negative,
     check_positive,
@@ -33,6 +32,8 @@ BoolArray = NDArray[np.bool_]
 
 FORMAT = "lagros-scenario-1"
 ATTEMPTS = 1000  # of a whole scenario, before the density is called impossible
+# Of a coordinate and a radius [m]: planners look for ways in time, and no thruster gets farther.
+LARGEST = 1e4
 MOST_AGENTS, MOST_OBSTACLES = 1000, 10_000  # all pairs of them are looked at
 GRID = 0.15  # cell of the grid on which a way is looked for [m]
 
