@@ -362,7 +362,8 @@ def run_and_report(
         interrupted(_where_kept(kept))
     print_report(rows)
     if delivery.problems or not (delivery.written or printing_failed() is None):
-        progress_line(f"lagros: something was not written or printed{_where_kept(kept)}")
+        if len(kept):
+            progress_line(f"lagros: not all was written or printed{_where_kept(kept)}")
     elif not keep:
         kept.remove()
         if folder == BENCH_FOLDER:
