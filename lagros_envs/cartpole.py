@@ -283,7 +283,7 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         return task.sample_scenario(self._shared.scenario, self.settings)
 
     def _force(self, action: NDArray[np.float32]) -> float:
-        if type(action) is np.ndarray and action.shape == (1,) and action.dtype.kind == "f":
+        if type(action) is np.ndarray and action.shape == (1,) and action.dtype.char in "fd":
             value = action.item()
         else:
             value = math.nan
