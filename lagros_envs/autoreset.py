@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from lagros_envs.checks import shown
 from lagros_envs.conventions import (
     Conforming,
     End,
@@ -279,18 +280,16 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
             self._end = End.REACHED
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None] | None:
-        if seed is None or isinstance(seed, int | np.integer):
+        if not isinstance(seed, Sequence | np.ndarray):
             first = plain_seed(seed)
             # Gymnasium's convention. The runs of this project give lists, from
             # `seeding.episode_seeds`: neighbouring seeds would share episodes.
             return None if first is None else list(range(first, first + self.num_worlds))
-        seeds = [None if value is None else int(value) for value in seed]
-        if len(seeds) != self.num_worlds or any(value is not None and value < 0 for value in seeds):
+        if len(seed) != self.num_worlds:
             raise ValueError(
-                f"seed must be {self.num_worlds} non-negative integers, one per world; it is "
-                f"{seed!r}"
+                f"seed={shown(seed)} must be {self.num_worlds} non-negative integers, one per world"
             )
-        return seeds
+        return [plain_seed(value) for value in seed]
 
     def _refuse_worst(self) -> None:
         if self.disturbance.kind == "worst":

@@ -186,7 +186,7 @@ class CartPoleVectorEnv(RestartingVectorEnv):
     @property
     def state(self) -> FloatArray:
         """The states x in double precision, shape (num_envs, 4)."""
-        return np.ascontiguousarray(self._kept[_STATE].T)
+        return np.array(self._kept[_STATE].T, order="C")
 
     @property
     def _goal(self) -> FloatArray:
@@ -303,7 +303,7 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         if not self.disturbance.is_feedback:
             return push
         now = self._kept[_NOW].copy()
-        situation = Situation(self.state, self._nominal_now(), now, np.ascontiguousarray(push.T))
+        situation = Situation(self.state, self._nominal_now(), now, np.array(push.T, order="C"))
         # A copy: a callable may return an array that it keeps.
         return np.array(self.disturbance.respond(situation).T, order="C")
 

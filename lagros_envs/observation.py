@@ -159,7 +159,7 @@ def observe(
         across, up = world.centres_by_agent[0] - x, world.centres_by_agent[1] - y
         seen = across, up, world.radii_by_agent
         _fill(parts[at["obstacles"]], parts[at["obstacle_mask"]], seen, world.sight_by_agent)
-    return np.ascontiguousarray(columns.T).reshape(worlds, agents, -1)
+    return np.array(columns.T, order="C").reshape(worlds, agents, -1)
 
 
 def _fill(

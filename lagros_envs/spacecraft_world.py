@@ -114,7 +114,7 @@ class SpacecraftWorld:
     @property
     def states(self) -> FloatArray:
         """The states x, shape (worlds, agents, 6)."""
-        return np.ascontiguousarray(np.moveaxis(self.parts, 0, -1))
+        return np.array(np.moveaxis(self.parts, 0, -1), order="C")
 
     @property
     def time(self) -> FloatArray:

@@ -144,6 +144,15 @@ SINGLE = {
     ),
 }
 VECTOR = {
+    "one cart-pole": Subject(
+        _vector(CartPoleVectorEnv, "same_step", num_envs=1, compiled=False), Batch, True, _OF_CARTS
+    ),
+    "one spacecraft": Subject(
+        _vector(SpacecraftVectorEnv, "same_step", num_envs=1, compiled=False),
+        Batch,
+        False,
+        _OF_WORLDS,
+    ),
     **{
         f"cart-poles, {mode}": Subject(
             _vector(CartPoleVectorEnv, mode, num_envs=3, compiled=False), Batch, True, _OF_CARTS

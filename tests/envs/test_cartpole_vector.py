@@ -505,7 +505,7 @@ def test_actions_that_make_no_sense_are_refused(actions, message):
     ("reset", "message"),
     [
         ({"seed": [1, 2]}, "3 non-negative integers"),
-        ({"seed": [1, 2, -3]}, "3 non-negative integers"),
+        ({"seed": [1, 2, -3]}, "seed=-3 must be a non-negative integer"),
         ({"options": {"reset_mask": np.ones(2, bool)}}, "must be 3 booleans"),
         ({"options": {"reset_mask": np.ones(3)}}, "must be 3 booleans"),
         ({"options": {"reset_mask": np.array([True, False, True])}}, "first reset"),

@@ -43,7 +43,7 @@ def unchanged(one, refused, *arguments, **options):
     with pytest.raises(ValueError, match=options.pop("match")) as caught:
         refused(*arguments, **options)
     assert "\n" not in str(caught.value)
-    np.testing.assert_equal(one.play(), other.play())
+    np.testing.assert_equal(one.play(6), other.play(6))
     np.testing.assert_equal(one.reset(), other.reset())
 
 
@@ -108,7 +108,8 @@ def test_a_scenario_that_does_not_fit_changes_nothing(name):
     one = begun(name)
     crowd = PRESETS["open"].sample(np.random.default_rng(0), 7)
     for given, match in ((crowd, "has 7 agents"), ("file.json", "has a str")):
-        options = {"scenarios": [None, given]} if name in VECTOR else {"scenario": given}
+        others = [None] * (getattr(one.env, "num_worlds", 1) - 1)
+        options = {"scenarios": [*others, given]} if name in VECTOR else {"scenario": given}
         unchanged(one, one.env.reset, seed=9, options=options, match=match)
 
 
@@ -139,6 +140,17 @@ def test_a_first_reset_that_is_refused_starts_nothing(name):
 def test_seeds_that_are_none_change_nothing(name, seed):
     one = begun(name)
     unchanged(one, one.env.reset, seed=seed, match="seed")
+
+
+@pytest.mark.parametrize("entry", [-1, 1.5, True, "3", math.nan])
+@pytest.mark.parametrize("name", [name for name in PLAIN if name in VECTOR])
+def test_lists_of_seeds_with_one_that_is_none_change_nothing(name, entry):
+    one = begun(name)
+    worlds = one.env.num_worlds
+    unchanged(one, one.env.reset, seed=[*range(worlds - 1), entry], match="seed=")
+    match = f"must be {worlds} non-negative integers, one per world"
+    unchanged(one, one.env.reset, seed=[1] * (worlds + 1), match=match)
+    unchanged(one, one.env.reset, seed=[], match=match)
 
 
 @pytest.mark.parametrize("name", PLAIN)
