@@ -18,6 +18,7 @@ from lagros_benchmarks import cli, library
 from lagros_benchmarks.extras import MODULES, install_hint
 from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
 from tests.benchmarks import fakes
+from tests.lowest import lowest
 
 ROOT = Path(__file__).parents[2]
 # Where the name of the import is not that of the distribution.
@@ -272,3 +273,24 @@ def test_python_m_is_the_command():
         check=True,
     )
     assert result.stdout.startswith("lagros ")
+
+
+def test_the_lowest_versions_of_an_extra_are_those_of_its_ranges(project):
+    found = lowest(project, "bench")
+    assert set(found) == {
+        re.match(r"[a-z0-9-]+", line).group()
+        for lines in (
+            project["dependencies"],
+            *(project["optional-dependencies"][name] for name in ("bench", "policies", "render")),
+        )
+        for line in lines
+        if not line.startswith("lagros")
+    }
+    pinned = dict(
+        line.split("==")
+        for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+        if not line.startswith("#")
+    )
+    for name, version in found.items():
+        ours, first = (tuple(map(int, text.split("."))) for text in (pinned[name], version))
+        assert first <= ours
