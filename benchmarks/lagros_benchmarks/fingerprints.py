@@ -14,6 +14,7 @@ from typing import Any
 from lagros_benchmarks.library import Toolbox
 from lagros_benchmarks.settings import BenchmarkSettings
 from lagros_benchmarks.surroundings import machine, threads, versions
+from lagros_policies.naming import is_file, model_file, user_class
 
 _PACKAGES = ("lagros_envs", "lagros_policies", "lagros_benchmarks")
 # Modules, weights and settings that a class of the user's own may read.
@@ -62,11 +63,21 @@ def _named_files(value: Any) -> Iterator[tuple[str, list[Path]]]:
             yield from _named_files(item)
     elif isinstance(value, str | Path):
         text = str(value)
-        before, colon, after = text.rpartition(":")
-        if colon and not Path(after).is_file():
-            yield text, _module_files(before)
-        elif Path(after).is_file():
-            yield text, [Path(after)]
+        model = model_file(text)
+        path = Path(text) if model is None else model.path
+        if is_file(path):
+            yield text, [path]
+        elif (module := _module_named(text)) is not None:
+            yield text, _module_files(module)
+
+
+def _module_named(text: str) -> str | None:
+    """Return the module of module:Class; None if the text is something else."""
+    try:
+        named = user_class(text)
+    except ValueError:
+        return None
+    return None if named is None else named.module
 
 
 def _module_files(module: str) -> list[Path]:

@@ -142,13 +142,12 @@ def print_report(rows: Sequence[Row]) -> None:
         if group[0]["task"] == "spacecraft":
             console.print()  # its tables have no frame, which ends in an empty line
         for line in tables.comparison_lines(group):
-            console.print(line)
+            # As text, here and below: names and units may hold what rich takes for markup.
+            console.print(Text(line))
         console.print()
     for title, table in tables.sweep_tables(rows):
-        # As text: "[ms]" is markup to rich.
         console.print(Text(title))
         console.print(table)
         console.print()
     for line in (tables.legend(rows), *tables.error_lines(rows)):
-        # As text: the message of an exception may hold what rich takes for markup.
         console.print(Text(line))

@@ -244,10 +244,11 @@ def test_the_key_changes_with_all_that_a_result_depends_on(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     model, module, metric = (tmp_path / name for name in ("m.zip", "pilots.py", "metric.json"))
-    for path in (model, module, metric):
+    odd = tmp_path / "m:a=1.zip"
+    for path in (model, module, metric, odd):
         path.write_text("1")
     settings = BenchmarkSettings(
-        policies=("lagros", "m.zip", "sac:m.zip", "pilots:Good"), metric="metric.json"
+        policies=("lagros", "sac:m.zip", "ppo:m:a=1.zip", "pilots:Good"), metric="metric.json"
     )
 
     def key(**changes):
@@ -265,7 +266,7 @@ def test_the_key_changes_with_all_that_a_result_depends_on(tmp_path, monkeypatch
         fingerprint(settings, fakes.EASY),
     ]
     weights = tmp_path / "weights.npz"
-    for path in (model, module, metric, tmp_path / "helper.py", weights):
+    for path in (model, odd, module, metric, tmp_path / "helper.py", weights):
         path.write_text("2")
         different.append(key())
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
