@@ -20,6 +20,8 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"
 
 _VMAS_STEPS = 10
+# Worlds and agents of the round "random", and the steps of an episode, as in `learner.py`.
+_CROWD, _CROWD_STEPS = (256, 6), 450
 _STEPS = 200
 _RESETS = 20
 
@@ -62,7 +64,31 @@ def _vmas() -> tuple[dict[str, Callable[[], float]], str]:
             env.step(action)
         return (time.perf_counter() - begun) / _VMAS_STEPS
 
-    return {"step": step}, version("vmas")
+    crowd = vmas.make_env(
+        "navigation",
+        num_envs=_CROWD[0],
+        device="cpu",
+        continuous_actions=True,
+        seed=0,
+        n_agents=_CROWD[1],
+        max_steps=_CROWD_STEPS,
+    )
+
+    def random() -> float:
+        """Go on for as many steps as an episode has, and reset the worlds that end."""
+        worlds, agents = _CROWD
+        drawn = [[2.0 * torch.rand(worlds, 2) - 1.0] * agents for _ in range(_VMAS_STEPS)]
+        begun = time.perf_counter()
+        for step in range(_CROWD_STEPS):
+            _, _, done, _ = crowd.step(drawn[step % _VMAS_STEPS])
+            if done.all():
+                crowd.reset()
+            elif done.any():
+                for world in torch.nonzero(done).flatten().tolist():
+                    crowd.reset_at(world)
+        return (time.perf_counter() - begun) / _CROWD_STEPS
+
+    return {"step": step, "random": random}, version("vmas")
 
 
 def _safe_control_gym() -> tuple[dict[str, Callable[[], float]], str]:

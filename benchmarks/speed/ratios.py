@@ -178,7 +178,7 @@ class Peer:
         return line
 
 
-def _variants(default: str) -> dict[str, dict[str, bool]]:
+def variants(default: str) -> dict[str, dict[str, bool]]:
     """Return the settings of both ways to integrate, the one that nobody has to ask for first.
 
     Args:
@@ -194,7 +194,7 @@ def _variants(default: str) -> dict[str, dict[str, bool]]:
 def _single(scale: Scale, safe: Peer) -> list[Duel]:
     envs = {
         name: gym.make(_CARTPOLE, **_CARTPOLE_DISTURBANCE, **settings)
-        for name, settings in _variants("plain").items()
+        for name, settings in variants("plain").items()
     }
     calm = np.zeros(1, np.float32)
     steps: dict[str, Candidate] = {
@@ -241,7 +241,7 @@ def _vector(scale: Scale) -> Duel:
             gym.make_vec(_CARTPOLE, num_envs=scale.worlds, **_CARTPOLE_DISTURBANCE, **settings),
             lambda observations: lqr.predict(observations)[0],
         )
-        for name, settings in _variants("compiled").items()
+        for name, settings in variants("compiled").items()
     }
     theirs = gym.make_vec(
         "CartPole-v1", num_envs=scale.worlds, vectorization_mode="vector_entry_point"
@@ -258,7 +258,7 @@ def _spacecraft(scale: Scale, vmas: Peer) -> Duel:
     actions = np.random.default_rng(0).uniform(0.0, _THRUST, (_WORLD_STEPS, rows, 8))
     flights: dict[str, Candidate] = {}
     scenarios: list[Any] | None = None
-    for name, settings in _variants("compiled").items():
+    for name, settings in variants("compiled").items():
         envs = gym.make_vec(
             "lagros/Spacecraft-v0",
             num_envs=rows,

@@ -2,8 +2,9 @@
 
 Prints one table per topic and the targets with what was measured. The whole run takes a few
 minutes; start it on an idle machine. The topic `ratios` alone prints how many times as fast as its
-peers lagros is. casadi is the only peer that lagros does not need itself (`pip install -e
-".[speed]"`, or `make speed`); onnxruntime and numba take part where they are installed.
+peers lagros is, and `learner` the same for random actions and the resets that they bring. casadi is
+the only peer that lagros does not need itself (`pip install -e ".[speed]"`, or `make speed`);
+onnxruntime and numba take part where they are installed.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE.parent / "results" / "speed.json"
 RATIOS = HERE.parent / "results" / "speed_ratios.json"
-TOPICS = ("planner", "sdp", "network", "hold", "environment", "ratios")
+LEARNER = HERE.parent / "results" / "speed_learner.json"
+TOPICS = ("planner", "sdp", "network", "hold", "environment", "ratios", "learner")
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 
 
@@ -61,8 +63,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__.partition("\n\n")[0],
-        epilog=f"A complete run writes {RESULTS.relative_to(HERE.parents[1])}, the topic ratios "
-        f"alone {RATIOS.name} beside it; --quick and other choices write a file only with --json.",
+        epilog=f"A complete run writes {RESULTS.relative_to(HERE.parents[1])}, the topics ratios "
+        f"and learner alone {RATIOS.name} and {LEARNER.name} beside it; --quick and other choices "
+        "write a file only with --json.",
     )
     # No `choices`: argparse would check the empty list against them.
     parser.add_argument("topics", nargs="*", type=_topic, help=f"some of {', '.join(TOPICS)}")
@@ -75,7 +78,7 @@ def _published(topics: Sequence[str]) -> Path | None:
     """Return the file that a complete run of these topics renews."""
     if not topics:
         return RESULTS
-    return RATIOS if list(topics) == ["ratios"] else None
+    return {("ratios",): RATIOS, ("learner",): LEARNER}.get(tuple(topics))
 
 
 def _topic(name: str) -> str:

@@ -2,9 +2,10 @@
 
 import sys
 
+import gymnasium as gym
 import numpy as np
 import pytest
-from speed import ratios, report, run, timing
+from speed import learner, ratios, report, run, timing
 
 STUB = """#!{python}
 import json, sys
@@ -77,6 +78,7 @@ def test_a_peer_that_ends_is_named(elsewhere):
 def test_each_choice_of_topics_has_its_file():
     assert run._published([]).name == "speed.json"
     assert run._published(["ratios"]).name == "speed_ratios.json"
+    assert run._published(["learner"]).name == "speed_learner.json"
     assert run._published(["sdp", "ratios"]) is None
 
 
@@ -90,3 +92,24 @@ def test_the_ratios_are_measured(monkeypatch):
     assert isinstance(section, report.Section)
     assert len({target.what for target in section.targets}) == len(section.targets) >= 8
     assert all(np.isfinite(target.measured) for target in section.targets)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_what_a_learner_meets_is_measured(monkeypatch):
+    monkeypatch.delenv("LAGROS_SPEED_VMAS", raising=False)
+    monkeypatch.setattr(learner, "_ROLLOUT", 2)
+    scale = timing.Scale(rounds=2, calls=2, worlds=3, designs=1)
+    (section,) = learner.sections(scale)
+    assert any("vmas not installed" in row.remark for row in section.rows)
+    assert all(np.isfinite(target.measured) for target in section.targets)
+    (share,) = [target for target in section.targets if not target.at_least]
+    assert 0.0 < share.measured < 1.0
+
+
+def test_random_actions_end_episodes_and_resets_are_counted():
+    env = gym.make_vec("lagros/CartPole-v0", num_envs=4, compiled=False)
+    ends = []
+    step = env.step
+    env.step = lambda actions: ends.append(step(actions)[2].sum())
+    assert learner.stepping_worlds(env, 60)(0) > 0.0
+    assert sum(ends) > 10
