@@ -310,6 +310,8 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
     ) -> None:
         """Start the masked worlds, from the seeds of all or from the shared generators."""
         worlds = np.flatnonzero(mask)
+        if not worlds.size:
+            return
         if seeds is None:
             self._start(worlds, None, given)
         else:

@@ -21,7 +21,7 @@ from lagros_envs.observation import (
 )
 from lagros_envs.options import checked_actions
 from lagros_envs.scenarios import Preset, Scenario
-from lagros_envs.seeding import episode_streams
+from lagros_envs.seeding import episode_streams, seeded_streams
 from lagros_envs.spacecraft_episode import SpacecraftEpisode, action_space
 
 FloatArray = NDArray[np.float64]
@@ -200,12 +200,11 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         seeds = (
             self.np_random.integers(2**63, size=worlds.size).tolist() if seeds is None else seeds
         )
-        streams = [episode_streams(seed) for seed in seeds]
         chosen = [
-            stated[world] or self.preset.sample(stream.scenario)
-            for world, stream in zip(worlds, streams, strict=True)
+            stated[world] or self.preset.sample(stream)
+            for world, stream in zip(worlds, seeded_streams(seeds, "scenario"), strict=True)
         ]
-        self.world.begin(worlds, chosen, [stream.disturbance for stream in streams])
+        self.world.begin(worlds, chosen, (episode_streams(seed).disturbance for seed in seeds))
 
     def _observation(self) -> Float32Array:
         return observe(self.world, self.layout, self._columns).reshape(self.num_envs, -1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -137,14 +137,15 @@ class SpacecraftWorld:
         self,
         worlds: IntArray,
         scenarios: Sequence[Scenario],
-        generators: Sequence[np.random.Generator],
+        generators: Iterable[np.random.Generator],
     ) -> None:
         """Start an episode in some worlds.
 
         Args:
             worlds: Which worlds.
             scenarios: One for each.
-            generators: The disturbance stream of each episode. Every agent has a stream of its own,
+            generators: The disturbance stream of each episode; not looked at where there is no
+                disturbance. Every agent has a stream of its own,
                 so that an agent meets the same disturbance among any number of others.
 
         Raises:
@@ -152,26 +153,16 @@ class SpacecraftWorld:
         """
         for scenario in scenarios:
             self.check(scenario)
-        settings = self.settings
-        for world, scenario, generator in zip(worlds, scenarios, generators, strict=True):
-            count = len(scenario.obstacles)
-            self.parts[:2, world] = scenario.starts.T
-            self.parts[2, world] = scenario.headings
-            self.goals[:, world] = scenario.goals.T
-            self.obstacle_centres[:, world] = 0.0
-            self.obstacle_centres[:, world, :count] = scenario.obstacles.T
-            self.obstacle_radii[world] = -np.inf
-            self.obstacle_radii[world, :count] = scenario.obstacle_radii
-            self.agent_radius[world] = scenario.agent_radius
-            self.core_radius[world] = scenario.core
-            self._place_obstacles(world)
+        self._place(worlds, scenarios)
+        for world, scenario in zip(worlds, scenarios, strict=True):
             self.scenarios[world] = scenario
-            if self.disturbance.kind == "none":
-                continue
-            for agent, stream in enumerate(generator.spawn(self.agents)):
-                self._pushes[world, :, :, agent] = self.disturbance.realise(
-                    stream, settings.steps, settings.control_period
-                )
+        settings = self.settings
+        if self.disturbance.kind != "none":
+            for world, generator in zip(worlds, generators, strict=True):
+                for agent, stream in enumerate(generator.spawn(self.agents)):
+                    self._pushes[world, :, :, agent] = self.disturbance.realise(
+                        stream, settings.steps, settings.control_period
+                    )
         self.parts[3:, worlds] = 0.0
         self.start_headings[worlds] = self.parts[2, worlds]
         self.forces[:, worlds] = 0.0
@@ -273,15 +264,28 @@ class SpacecraftWorld:
                 f"obstacle_count=(0, {len(scenario.obstacles)}))"
             )
 
-    def _place_obstacles(self, world: int) -> None:
-        """Write the obstacles of a world once for every agent."""
-        centres, radii = self.obstacle_centres[:, world], self.obstacle_radii[world]
+    def _place(self, worlds: IntArray, scenarios: Sequence[Scenario]) -> None:
+        """Write agents, goals and obstacles of the worlds, obstacles once for every agent."""
+        # Coordinates first.
+        self.parts[:2, worlds] = np.stack([one.starts.T for one in scenarios], 1)
+        self.parts[2, worlds] = [one.headings for one in scenarios]
+        self.goals[:, worlds] = np.stack([one.goals.T for one in scenarios], 1)
+        centres = np.zeros((2, worlds.size, self.obstacles))
+        radii = np.full(centres.shape[1:], -np.inf)
+        for place, one in enumerate(scenarios):
+            count = len(one.obstacles)
+            centres[:, place, :count] = one.obstacles.T
+            radii[place, :count] = one.obstacle_radii
+        core = np.array([one.core for one in scenarios])
+        self.obstacle_centres[:, worlds], self.obstacle_radii[worlds] = centres, radii
+        self.agent_radius[worlds] = [one.agent_radius for one in scenarios]
+        self.core_radius[worlds] = core
         # -inf where there is no obstacle: its reach must not count.
         reach = np.maximum(radii + self.settings.sensing_radius, -1.0)
-        self.centres_by_agent[:, :, world] = centres[..., None]
-        self.radii_by_agent[:, world] = np.where(np.isfinite(radii), radii, 0.0)[:, None]
-        self.contact_by_agent[:, world] = (radii + self.core_radius[world])[:, None]
-        self.sight_by_agent[:, world] = (reach * np.abs(reach))[:, None]
+        self.centres_by_agent[:, :, worlds] = np.moveaxis(centres, 1, -1)[..., None]
+        self.radii_by_agent[:, worlds] = np.where(np.isfinite(radii), radii, 0.0).T[..., None]
+        self.contact_by_agent[:, worlds] = (radii + core[:, None]).T[..., None]
+        self.sight_by_agent[:, worlds] = (reach * np.abs(reach)).T[..., None]
 
     def _current_push(self) -> FloatArray:
         """Return d of this step, (6, worlds, agents)."""

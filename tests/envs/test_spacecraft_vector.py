@@ -274,3 +274,10 @@ def test_actions_seeds_and_options_that_make_no_sense_are_refused():
     ):
         with pytest.raises(ValueError, match=message):
             envs.reset(options=options)
+
+
+def test_a_reset_of_no_world_changes_nothing():
+    envs = vector(3, 2, disturbance="uniform")
+    before, _ = envs.reset(seed=0)
+    after, _ = envs.reset(seed=1, options={"reset_mask": np.zeros(3, bool)})
+    np.testing.assert_array_equal(after, before)
