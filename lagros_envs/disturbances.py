@@ -2,7 +2,8 @@
 
 A disturbance is constant over a control step. An open-loop kind draws the whole episode at reset,
 as a sequence in the unit ball that the bound then scales: a larger bound is the same realisation,
-larger. A feedback kind (`worst`, or any callable) looks at the state instead.
+larger. (An episode without a seed may draw it step by step, see `stepwise`.) A feedback kind
+(`worst`, or any callable) looks at the state instead.
 """
 
 from __future__ import annotations

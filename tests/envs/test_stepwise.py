@@ -1,9 +1,14 @@
 """Disturbances drawn step by step have the laws of those drawn in advance."""
 
+import copy
+import pickle
+
+import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.stats import ks_2samp
 
+import lagros_envs  # noqa: F401 - registers the ids
 from lagros_envs.disturbances import OPEN_LOOP, Disturbance
 from lagros_envs.stepwise import StepwiseDisturbance
 
@@ -85,3 +90,24 @@ def test_another_generator_starts_anew_and_what_was_begun_stays():
     constant = StepwiseDisturbance(Disturbance("constant", 0.3, MASKS["all"]), 2, PERIOD)
     constant.begin(np.arange(2), rngs[0])
     np.testing.assert_array_equal(constant.step(0, rngs[0]), constant.step(1, rngs[1]))
+
+
+@pytest.mark.parametrize("kind", sorted(OPEN_LOOP))
+def test_copies_go_on_alike_after_episodes_without_a_seed(kind):
+    envs = gym.make_vec("lagros/CartPole-v0", num_envs=5, disturbance=kind, compiled=False)
+    one = gym.make("lagros/CartPole-v0", disturbance=kind)
+    rng = np.random.default_rng(0)
+    for env, rows in ((envs.unwrapped, (5, 1)), (one.unwrapped, (1,))):
+        env.reset(seed=0)
+        env.reset()
+        env.step(rng.uniform(-1.0, 1.0, rows).astype(np.float32))
+        copies = [env, copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+        for _ in range(4):
+            actions = rng.uniform(-1.0, 1.0, rows).astype(np.float32)
+            first, *others = [
+                (each.step(actions)[0], each.reset()[0], each.step(actions)[4]["disturbance"])
+                for each in copies
+            ]
+            for other in others:
+                for found, expected in zip(other, first, strict=True):
+                    np.testing.assert_array_equal(found, expected)
