@@ -194,9 +194,22 @@ class BenchmarkSettings:
             self._check_alone()
         else:
             self._check_spacecraft()
-        strangers = set(self.policy_settings) - set(self.policies)
+        self._check_policy_settings()
+
+    def _check_policy_settings(self) -> None:
+        given = self.policy_settings
+        held = isinstance(given, Mapping) and all(
+            isinstance(one, Mapping) and all(isinstance(name, str) for name in one)
+            for one in given.values()
+        )
+        if not held:
+            raise ValueError(
+                f"policy_settings={shown(given)} must be mappings of names to values, one for each "
+                "policy that has any"
+            )
+        strangers = [name for name in given if name not in self.policies]
         if strangers:
-            raise ValueError(f"policy_settings names {sorted(strangers)}, which do not run")
+            raise ValueError(f"policy_settings names {strangers}, which do not run")
 
     def _check_alone(self) -> None:
         for name, none in (("preset", None), ("agents", ()), ("safety_filter", "none")):

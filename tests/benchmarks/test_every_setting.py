@@ -154,6 +154,14 @@ def test_counts_that_no_machine_holds_are_refused(name, most):
         BenchmarkSettings(**{name: most})
 
 
+@pytest.mark.parametrize("given", [None, [], "lqr", {"lqr": 5}, {"lqr": {1: 2}}, {"lqr": None}])
+def test_settings_of_policies_are_mappings(given):
+    from lagros_benchmarks.settings import BenchmarkSettings
+
+    with pytest.raises(ValueError, match=r"^policy_settings=.+ must be mappings"):
+        BenchmarkSettings(policies=("lqr",), policy_settings=given)
+
+
 @pytest.mark.parametrize("count", [10**4, 10**6, 10**12])
 def test_worlds_of_more_agents_than_memory_holds_are_refused(count):
     from lagros_benchmarks.settings import BenchmarkSettings
