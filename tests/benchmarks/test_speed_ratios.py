@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from speed import learner, ratios, report, run, timing
 
-STUB = """#!{python}
+# For a shell, then for the Python that it runs: the path of Python may hold a space.
+STUB = """#!/bin/sh
+'''exec' "{python}" "$0" "$@"
+' '''
 import json, sys
 print(json.dumps({{"version": "9.9 of " + sys.argv[2], "rounds": ["step"]}}), flush=True)
 for number, line in enumerate(sys.stdin):

@@ -50,7 +50,8 @@ def stated_in_cvxpy(oracle, samples, region, settings):
         scaled = scale @ dual @ scale
         conditions += [scaled >> np.eye(4), scaled << chi * np.eye(4)]
     problem = cp.Problem(cp.Minimize(chi + settings.control_penalty * nu), conditions)
-    problem.solve(solver=cp.CLARABEL, tol_feas=1e-7, tol_gap_abs=1e-7, tol_gap_rel=1e-7)
+    # Far below what is compared, and within reach of every BLAS.
+    problem.solve(solver=cp.CLARABEL, tol_feas=1e-6, tol_gap_abs=1e-6, tol_gap_rel=1e-6)
     assert problem.status == "optimal"
     return float(chi.value), float(nu.value)
 
