@@ -286,13 +286,15 @@ class CartPoleVectorEnv(RestartingVectorEnv):
         self._step += 1
         kept[_EFFORT] += effort
         # A comparison with nan gives False: what could not be integrated stays and has fallen.
-        lost = np.flatnonzero(~(distance <= task.LARGEST_DISTANCE))
-        if lost.size:
+        within = distance <= task.LARGEST_DISTANCE
+        lost = None if np.count_nonzero(within) == within.size else np.flatnonzero(~within)
+        if lost is not None:
             following[:, lost] = kept[_STATE, lost]
             distance[lost] = kept[_DISTANCE, lost]
         kept[_STATE], kept[_DISTANCE] = following, distance
         fallen = np.greater(np.abs(following[1]), task.FALL_ANGLE, out=self._flags[_FALLEN])
-        fallen[lost] = True
+        if lost is not None:
+            fallen[lost] = True
         return effort, rewards
 
     def _current_push(self) -> FloatArray:
@@ -322,12 +324,13 @@ class CartPoleVectorEnv(RestartingVectorEnv):
     def _force(self, actions: NDArray[np.float32]) -> FloatArray:
         if type(actions) is np.ndarray and actions.dtype == np.float32:
             # What single precision holds does not overflow on its way to a force.
+            values = actions.reshape(-1)
             usual = actions.shape == (self.num_envs, 1)
-            if usual and np.count_nonzero(np.isfinite(actions)) == actions.size:
-                return self._applied(actions[:, 0].astype(np.float64))
-        values = checked_actions(actions, (self.num_envs, 1), "the force of each world")
+            if usual and np.count_nonzero(np.isfinite(values)) == values.size:
+                return self._applied(values.astype(np.float64))
+        checked = checked_actions(actions, (self.num_envs, 1), "the force of each world")
         with np.errstate(over="ignore"):
-            return self._applied(values[:, 0])
+            return self._applied(checked[:, 0])
 
     def _applied(self, values: FloatArray) -> FloatArray:
         force: FloatArray = task.applied_force(self.settings, values, np.clip)
@@ -335,7 +338,8 @@ class CartPoleVectorEnv(RestartingVectorEnv):
 
     def _clock(self) -> tuple[FloatArray, FloatArray]:
         """Return t [s] and r(t) of every world."""
-        if np.count_nonzero(self._step >= self._times.size):
+        disabled = self.autoreset_mode is AutoresetMode.DISABLED
+        if disabled and np.count_nonzero(self._step >= self._times.size):
             # A caller who ignored `truncated`.
             times: FloatArray = np.multiply(self._step, self.settings.control_period)
             radii: FloatArray = self.settings.tube.radius(times)
@@ -362,7 +366,9 @@ class CartPoleVectorEnv(RestartingVectorEnv):
 
     def _observation(self) -> NDArray[np.float32]:
         observation = self._blank.copy()
-        observation[:, task.STATE] = self._kept[_STATE].T
+        # One by one: quicker than to turn all four.
+        for column in range(task.STATE_DIM):
+            observation[:, column] = self._kept[column]
         observation[:, task.TIME] = self._kept[_NOW]
         return observation
 
