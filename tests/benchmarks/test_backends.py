@@ -392,7 +392,7 @@ def test_what_the_work_raises_is_raised_as_it_is(place):
 
 def without_timings(rows):
     """Return the rows as they are written, without times and without what the run ran on."""
-    other = ("step_time", "forward_time", "deadline", "threads", "command")
+    other = ("step_time", "forward_time", "deadline", "threads", "timing_raised", "command")
     return [
         {name: value for name, value in row.items() if not name.startswith(other)}
         for row in json.loads(json.dumps(plain(rows)))
