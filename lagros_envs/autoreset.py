@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from lagros_envs.checks import shown
+from lagros_envs.checks import check_name, shown
 from lagros_envs.conventions import (
     Conforming,
     End,
@@ -46,8 +46,7 @@ def autoreset_mode_named(mode: str | AutoresetMode) -> AutoresetMode:
     """
     if isinstance(mode, AutoresetMode):
         return mode
-    if mode not in MODES:
-        raise ValueError(f"autoreset_mode={mode!r} must be one of {', '.join(MODES)}")
+    check_name("autoreset_mode", mode, MODES)
     return MODES[mode]
 
 
@@ -280,16 +279,19 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
             self._end = End.REACHED
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None] | None:
-        if not isinstance(seed, Sequence | np.ndarray):
-            first = plain_seed(seed)
+        # Bytes are a sequence of integers, but nobody's seeds.
+        listed = isinstance(seed, Sequence) and not isinstance(seed, str | bytes | bytearray)
+        if not (listed or (isinstance(seed, np.ndarray) and seed.ndim == 1)):
+            first = plain_seed(cast("int | None", seed))
             # Gymnasium's convention. The runs of this project give lists, from
             # `seeding.episode_seeds`: neighbouring seeds would share episodes.
             return None if first is None else list(range(first, first + self.num_worlds))
-        if len(seed) != self.num_worlds:
+        seeds = list(cast("Sequence[int | None]", seed))
+        if len(seeds) != self.num_worlds:
             raise ValueError(
                 f"seed={shown(seed)} must be {self.num_worlds} non-negative integers, one per world"
             )
-        return [plain_seed(value) for value in seed]
+        return [plain_seed(value) for value in seeds]
 
     def _refuse_worst(self) -> None:
         if self.disturbance.kind == "worst":

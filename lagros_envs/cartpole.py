@@ -111,22 +111,22 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         """Build the environment; see the class for the arguments."""
         self.render_mode = check_render_mode(render_mode)
         self.settings = settings_of(task.CartPoleSettings(), settings)
+        self.disturbance = Disturbance(
+            disturbance, disturbance_bound, channel_mask(disturbance_channels, task.RATES), metric
+        )
+        self._feedback = self.disturbance.is_feedback
+        self._calm = self.disturbance.kind == "none"
         self._hold = HeldStep(
             self.settings.system,
             self.settings.control_period,
             compiled,
             measure=task.StepMeasure(self.settings),
             given=task.STATE_DIM,
-            pushed=disturbance != "none",
+            pushed=not self._calm,
         )
-        self._calm = disturbance == "none"
         self._steps = self.settings.steps
         # r(t) at every control instant.
         self._radii: list[float] = [self._radius(step) for step in range(self._steps + 1)]
-        self.disturbance = Disturbance(
-            disturbance, disturbance_bound, channel_mask(disturbance_channels, task.RATES), metric
-        )
-        self._feedback = self.disturbance.is_feedback
         # Drawn in advance if the episode has a seed of its own.
         self._pushes: FloatArray | None = None
         self._stepwise = StepwiseDisturbance(self.disturbance, 1, self.settings.control_period)

@@ -124,7 +124,7 @@ class CartPoleVectorEnv(RestartingVectorEnv):
             compiled,
             measure=task.StepMeasure(self.settings),
             given=task.STATE_DIM,
-            pushed=disturbance != "none",
+            pushed=self.disturbance.kind != "none",
         )
         self.compiled = self._hold.compiled
         self._allocate()

@@ -196,13 +196,13 @@ def check_seed(seed: int) -> None:
     _check(holds, "seed", seed, "a non-negative integer below 2**128")
 
 
-def check_flag(name: str, value: bool) -> None:
-    """Check what must be true or false.
+def check_flag(name: str, value: bool, otherwise: str = "") -> None:
+    """Check what must be true or false; arguments as in `check_positive`.
 
     Raises:
         ValueError: It is neither True nor False.
     """
-    _check(isinstance(value, bool), name, value, "True or False")
+    _check(isinstance(value, bool), name, value, "True or False", otherwise)
 
 
 def check_name(name: str, value: str, valid: Iterable[str]) -> None:

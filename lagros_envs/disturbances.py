@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,13 @@ class Situation:
     nominal: FloatArray | None
     time: FloatArray
     direction: FloatArray
+
+    def copy(self) -> Situation:
+        """Return the same in arrays of its own, which a callable may write to."""
+        nominal = None if self.nominal is None else np.array(self.nominal)
+        return Situation(
+            np.array(self.state), nominal, np.array(self.time), np.array(self.direction)
+        )
 
 
 Feedback = Callable[[Situation], FloatArray]
@@ -196,7 +203,8 @@ class WorstCase(ByValue):
         """Return M e, shape (..., n); the caller masks it and scales it to the bound.
 
         Raises:
-            ValueError: The episode has no nominal trajectory.
+            ValueError: The episode has no nominal trajectory, or the function that is the metric
+                returned a wrong shape or what is not finite.
         """
         if situation.nominal is None:
             raise ValueError(
@@ -204,10 +212,25 @@ class WorstCase(ByValue):
                 'pass reset(options={"nominal": array of shape (steps + 1, n)})'
             )
         error = situation.state - situation.nominal
-        metric = self.metric(situation.state) if callable(self.metric) else self.metric
+        metric = self._at(situation.state) if callable(self.metric) else self.metric
         gradient = np.einsum("...ij,...j->...i", metric, error)
         # An error of zero has no gradient: the direction of the episode breaks the tie.
         return np.where(np.any(error != 0.0, axis=-1, keepdims=True), gradient, situation.direction)
+
+    def _at(self, state: FloatArray) -> FloatArray:
+        """Return M at states (..., n) from the function of the user."""
+        returned = cast("Feedback", self.metric)(state.copy())
+        matrices, shape = real_numbers(returned), (*state.shape, state.shape[-1])
+        if (
+            matrices is None
+            or matrices.shape not in (shape, shape[-2:])
+            or not np.isfinite(matrices).all()
+        ):
+            raise ValueError(
+                f"the function metric returned {_described(returned, matrices)}; for states of "
+                f"shape {state.shape} it must return finite numbers of shape {shape}"
+            )
+        return matrices
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +256,7 @@ class Disturbance(ByValue):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        if not callable(self.kind) and self.kind not in KINDS:
+        if not callable(self.kind) and not (isinstance(self.kind, str) and self.kind in KINDS):
             raise ValueError(
                 f"disturbance={shown(self.kind)} is not known; use one of {', '.join(KINDS)} or a "
                 f"callable.{suggestion(self.kind, KINDS)}"
@@ -320,17 +343,26 @@ class Disturbance(ByValue):
         """
         if self.feedback is None:
             raise ValueError(f"disturbance={self.kind!r} does not respond to states: realise it")
-        push = np.asarray(self.feedback(situation), dtype=np.float64)
-        if push.shape != situation.state.shape or not np.all(np.isfinite(push)):
+        if isinstance(self.kind, str):
+            gradient = self.feedback(situation) * np.asarray(self.channels)
+            if not np.isfinite(gradient).all():
+                raise ValueError(f"metric={shown(self.metric)} is too large: M e is not finite")
+            return self.bound * onto_unit_sphere(gradient, situation.direction)
+        returned = self.feedback(situation.copy())
+        push = real_numbers(returned)
+        if push is None or push.shape != situation.state.shape or not np.isfinite(push).all():
             raise ValueError(
-                f"the disturbance callable returned shape {push.shape} (finite: "
-                f"{bool(np.all(np.isfinite(push)))}); it must return finite values of the state's "
-                f"shape {situation.state.shape}"
+                f"the disturbance callable returned {_described(returned, push)}; it must return "
+                f"finite numbers of the state's shape {situation.state.shape}"
             )
-        push = push * np.asarray(self.channels)
-        if self.kind == "worst":
-            return self.bound * onto_unit_sphere(push, situation.direction)
-        return into_ball(push, self.bound)
+        return into_ball(push * np.asarray(self.channels), self.bound)
+
+
+def _described(returned: Any, numbers: FloatArray | None) -> str:
+    """Say what a function of the user has returned, and as numbers where it is made of them."""
+    if numbers is None:
+        return shown(returned)
+    return f"shape {numbers.shape} (finite: {bool(np.isfinite(numbers).all())})"
 
 
 def channel_mask(

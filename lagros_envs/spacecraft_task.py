@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import (
     LARGEST,
+    MOST_STEPS,
     check_at_most,
     check_fields,
     check_multiple,
@@ -107,11 +108,11 @@ def limited(settings: SpacecraftSettings, steps: int | None) -> SpacecraftSettin
     """Return the settings with an episode of this many control steps; None leaves them.
 
     Raises:
-        ValueError: The number is less than 1.
+        ValueError: The number is less than 1, or enormous.
     """
     if steps is None:
         return settings
-    check_whole("max_cycles", steps)
+    check_whole("max_cycles", steps, most=MOST_STEPS)
     return replace(settings, time_limit=steps * settings.control_period)
 
 

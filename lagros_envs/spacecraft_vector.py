@@ -82,7 +82,8 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
     ) -> None:
         """Build the worlds; see the class for the arguments."""
         check_whole("num_agents", num_agents)
-        if num_envs < 1 or num_envs % num_agents:
+        check_whole("num_envs", num_envs)
+        if num_envs % num_agents:
             raise ValueError(
                 f"num_envs={num_envs!r} must be a positive multiple of num_agents={num_agents}: "
                 "there is a row for every agent of every world"

@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_flag
 from lagros_envs.dynamics.integrate import SUBSTEPS
 from lagros_envs.dynamics.straight_line import (
     ArrayFunction,
@@ -42,6 +43,7 @@ class HeldStep:
             of an infinity, or returns nan where it is compiled.
 
     Raises:
+        ValueError: `compiled` is none of these.
         ImportError: `compiled` was asked for and numba is not installed.
     """
 
@@ -55,6 +57,7 @@ class HeldStep:
         pushed: bool = True,
     ) -> None:
         """Record the step."""
+        check_flag("compiled", compiled)
         self._made_from = system, duration, compiled, measure, given, pushed
         self.run: FloatStep = _float_step(
             cast(Hashable, system), duration, compiled, cast(Hashable, measure), given, pushed
@@ -86,6 +89,7 @@ class HeldBatch:
         measured: What the measure computed in the last call, shape (measured, *shape).
 
     Raises:
+        ValueError: `compiled` is none of these.
         ImportError: `compiled` was asked for and numba is not installed.
     """
 
@@ -101,6 +105,8 @@ class HeldBatch:
         pushed: bool = True,
     ) -> None:
         """Record the step and allocate its buffers."""
+        if compiled is not None:
+            check_flag("compiled", compiled, "or None for wherever numba is installed")
         self._made_from = system, duration, shape, compiled, substeps, measure, given, pushed
         n, m = system.state_dim, system.control_dim
         self._ends = n, n + m, n + m + (n if pushed else 0)

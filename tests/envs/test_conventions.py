@@ -143,6 +143,23 @@ def test_seeds_that_are_none_change_nothing(name, seed):
     unchanged(one, one.env.reset, seed=seed, match="seed")
 
 
+@pytest.mark.parametrize("seeds", [b"abc", bytearray(b"abc"), "abc", np.array(5), np.ones((3, 1))])
+@pytest.mark.parametrize("name", [name for name in PLAIN if name in VECTOR])
+def test_what_is_no_list_of_seeds_changes_nothing(name, seeds):
+    one = begun(name)
+    worlds = one.env.num_worlds
+    seeds = seeds if np.ndim(seeds) == 0 and not isinstance(seeds, bytes | str) else seeds[:worlds]
+    unchanged(one, one.env.reset, seed=seeds, match="seed=")
+
+
+@pytest.mark.parametrize("kind", [list, tuple, np.array, lambda seeds: np.array(seeds, object)])
+@pytest.mark.parametrize("name", [name for name in PLAIN if name in VECTOR])
+def test_seeds_may_be_any_list_of_whole_numbers(name, kind):
+    one, other = EVERY[name].players(2)
+    seeds = list(range(5, 5 + one.env.num_worlds))
+    np.testing.assert_equal(one.reset(seed=kind(seeds)), other.reset(seed=5))
+
+
 @pytest.mark.parametrize("entry", [-1, 1.5, True, "3", math.nan])
 @pytest.mark.parametrize("name", [name for name in PLAIN if name in VECTOR])
 def test_lists_of_seeds_with_one_that_is_none_change_nothing(name, entry):
@@ -482,6 +499,7 @@ def test_closing_twice_is_once(name):
         ({"disturbance": "wimd"}, "disturbance='wimd' is not known"),
         ({"disturbance": 3}, "disturbance=3 is not known"),
         ({"disturbance": {"kind": "gust"}}, "disturbance=.* is not known"),
+        ({"disturbance": np.zeros(2)}, "disturbance=.* is not known"),
         ({"disturbance_bound": "0.3"}, "disturbance_bound='0.3'"),
         ({"disturbance_bound": math.nan}, "disturbance_bound=nan"),
         ({"disturbance_bound": 1e300}, r"disturbance_bound=1e\+300 must be .* at most 1e\+06"),
@@ -499,3 +517,28 @@ def test_closing_twice_is_once(name):
 def test_arguments_that_make_no_sense_are_refused_by_name(name, change, match):
     with pytest.raises(ValueError, match=match):
         player(name, **change)
+
+
+WITH_COMPILED = [name for name in PLAIN if EVERY[name].cartpole or name in VECTOR]
+
+
+@pytest.mark.parametrize("value", ["false", "", 1, 0.0, [1], np.zeros(2)])
+@pytest.mark.parametrize("name", WITH_COMPILED)
+def test_whether_to_compile_is_true_or_false(name, value):
+    kind = type(bare(player(name).env))
+    with pytest.raises(ValueError, match="compiled=.* must be True or False"):
+        kind(compiled=value)
+
+
+@pytest.mark.parametrize("value", [2.0, True, "2", 0, -2, np.zeros(2)])
+@pytest.mark.parametrize("name", [CARTPOLE, SPACECRAFT])
+def test_worlds_are_counted_in_whole_numbers(name, value):
+    with pytest.raises(ValueError, match="num_envs=.* must be a whole number"):
+        gym.make_vec(name, num_envs=value)
+
+
+@pytest.mark.parametrize("value", ["same step", None, 3, [1], np.zeros(2)])
+@pytest.mark.parametrize("name", [CARTPOLE, SPACECRAFT])
+def test_a_mode_of_autoreset_is_known_or_refused(name, value):
+    with pytest.raises(ValueError, match="autoreset_mode=.* must be one of next_step, same_step"):
+        gym.make_vec(name, num_envs=2, autoreset_mode=value)

@@ -281,12 +281,63 @@ def test_an_empty_mask_is_refused():
 
 
 @pytest.mark.parametrize(
-    "value", [np.zeros(3), np.zeros((1, 4)), 0.0, np.array([0.0, np.nan, 0.0, 0.0])]
+    "value",
+    [
+        np.zeros(3),
+        np.zeros((1, 4)),
+        0.0,
+        np.array([0.0, np.nan, 0.0, 0.0]),
+        None,
+        ["0", "0", "0", "1"],
+        np.ones(4) * 1j,
+        np.ones(4, bool),
+        np.ones(4, object),
+        np.ma.masked_array(np.ones(4), mask=True),
+    ],
 )
 def test_a_callable_that_returns_nonsense_is_refused(value):
     disturbance = Disturbance(lambda _: value, 0.5, ALL)
-    with pytest.raises(ValueError, match="must return finite values of the state's shape"):
+    with pytest.raises(ValueError, match="must return finite numbers of the state's shape"):
         disturbance.respond(situation(np.zeros(4)))
+
+
+@pytest.mark.parametrize(
+    "value",
+    [None, "M", 1.0, np.eye(3), np.eye(4) * 1j, np.full((4, 4), np.nan), np.ones((2, 4, 4))],
+)
+def test_a_metric_that_returns_nonsense_is_refused_by_name(value):
+    disturbance = Disturbance("worst", 0.5, ALL, lambda _: value)
+    with pytest.raises(ValueError, match=r"metric returned .* must return .* shape \(4, 4\)"):
+        disturbance.respond(situation(np.ones(4), np.zeros(4)))
+
+
+def test_a_metric_may_be_the_same_for_all_states_but_not_too_large():
+    now = situation(np.ones((3, 4)), np.zeros((3, 4)))
+    constant = Disturbance("worst", 0.5, ALL, METRIC).respond(now)
+    function = Disturbance("worst", 0.5, ALL, lambda _: METRIC).respond(now)
+    np.testing.assert_array_equal(function, constant)
+    with pytest.raises(ValueError, match="metric=.* is too large"):
+        with np.errstate(over="ignore"):
+            Disturbance("worst", 0.5, ALL, 1e308 * np.eye(4)).respond(
+                situation(np.full(4, 1e9), np.zeros(4))
+            )
+
+
+@pytest.mark.parametrize("kind", ["callable", "worst"])
+def test_a_function_may_write_to_what_it_is_shown(kind):
+    def spoil(now):
+        parts = (now.state, now.nominal, now.time, now.direction) if kind == "callable" else (now,)
+        for part in parts:
+            part[...] = 7.0
+        return parts[0] if kind == "callable" else METRIC
+
+    shown = situation(np.ones(4), np.zeros(4), np.array(0.3))
+    before = [np.array(part) for part in (shown.state, shown.nominal, shown.time, shown.direction)]
+    disturbance = Disturbance(spoil if kind == "callable" else "worst", 0.5, ALL, spoil)
+    disturbance.respond(shown)
+    after = shown.state, shown.nominal, shown.time, shown.direction
+    for one, other in zip(before, after, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_callable_sees_state_nominal_time_and_direction():
@@ -295,7 +346,7 @@ def test_a_callable_sees_state_nominal_time_and_direction():
     state, nominal = np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.5, 0.0, 0.0, 0.0])
     push = disturbance.respond(situation(state, nominal, time=0.3))
     np.testing.assert_allclose(push, state, rtol=1e-12)
-    assert seen[0].nominal is nominal
+    np.testing.assert_array_equal(seen[0].nominal, nominal)
     assert seen[0].time == 0.3
     np.testing.assert_array_equal(seen[0].direction, [1.0, 0.0, 0.0, 0.0])
 
