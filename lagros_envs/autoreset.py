@@ -279,14 +279,15 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
             self._end = End.REACHED
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None] | None:
+        given: Any = seed
         # Bytes are a sequence of integers, but nobody's seeds.
-        listed = isinstance(seed, Sequence) and not isinstance(seed, str | bytes | bytearray)
-        if not (listed or (isinstance(seed, np.ndarray) and seed.ndim == 1)):
-            first = plain_seed(cast("int | None", seed))
+        texts, lists = (str, bytes, bytearray), (Sequence, np.ndarray)
+        if not isinstance(given, lists) or isinstance(given, texts) or np.ndim(given) == 0:
+            first = plain_seed(given)
             # Gymnasium's convention. The runs of this project give lists, from
             # `seeding.episode_seeds`: neighbouring seeds would share episodes.
             return None if first is None else list(range(first, first + self.num_worlds))
-        seeds = list(cast("Sequence[int | None]", seed))
+        seeds = list(given)
         if len(seeds) != self.num_worlds:
             raise ValueError(
                 f"seed={shown(seed)} must be {self.num_worlds} non-negative integers, one per world"

@@ -205,6 +205,22 @@ def check_flag(name: str, value: bool, otherwise: str = "") -> None:
     _check(isinstance(value, bool), name, value, "True or False", otherwise)
 
 
+def check_instance(name: str, value: object, *kinds: type, otherwise: str = "") -> None:
+    """Check an object that must be of one of some classes.
+
+    Args:
+        name: What the caller calls it.
+        value: The object.
+        kinds: The classes.
+        otherwise: As in `check_positive`.
+
+    Raises:
+        ValueError: It is of none of them.
+    """
+    needed = " or ".join(f"a {kind.__name__}" for kind in kinds)
+    _check(isinstance(value, kinds), name, value, needed, otherwise)
+
+
 def check_name(name: str, value: str, valid: Iterable[str]) -> None:
     """Check a name against those that are known; the message suggests a close one.
 

@@ -219,7 +219,7 @@ class WorstCase(ByValue):
 
     def _at(self, state: FloatArray) -> FloatArray:
         """Return M at states (..., n) from the function of the user."""
-        returned = cast("Feedback", self.metric)(state.copy())
+        returned = cast("Callable[[FloatArray], FloatArray]", self.metric)(state.copy())
         matrices, shape = real_numbers(returned), (*state.shape, state.shape[-1])
         if (
             matrices is None

@@ -69,8 +69,10 @@ def check_file(path: str | Path, most: int = MOST_BYTES) -> str:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no regular file (a folder, a pipe, a device) or too large.
+        ValueError: It is no path, no regular file (a folder, a pipe, a device) or too large.
     """
+    if not isinstance(path, str | Path):
+        raise ValueError(f"{shown(path)} must be the path of a file")
     name = named(path)
     try:
         found = Path(path).stat()

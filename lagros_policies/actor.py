@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
 from lagros_envs.checks import check_positive, shown
+from lagros_envs.conventions import settings_of
 from lagros_policies.imitation.networks import Mlp, read_safetensors, write_safetensors
 from lagros_policies.observed import cartpole_rows
 from lagros_policies.trained_for import KEYS, cartpole_range, check_trained_for
@@ -182,7 +183,7 @@ class ActorPolicy:
         allow_other_settings: bool = False,
     ) -> None:
         """Load the actor; see the class for the arguments."""
-        self.settings = settings or task.CartPoleSettings()
+        self.settings = settings_of(task.CartPoleSettings(), settings)
         file = PRETRAINED / self.weights_file if weights is None else weights
         self.actor = weights = file if isinstance(file, Actor) else Actor.load(file)
         check_trained_for(

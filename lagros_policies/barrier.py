@@ -30,7 +30,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_fields, check_not_negative, check_positive
+from lagros_envs.checks import (
+    check_disturbance_bound,
+    check_fields,
+    check_not_negative,
+    check_positive,
+)
 from lagros_policies.sensed import Sensed
 
 FloatArray = NDArray[np.float64]
@@ -106,7 +111,7 @@ class BarrierSettings:
         Raises:
             ValueError: The bound is negative or not finite.
         """
-        check_not_negative("disturbance_bound", disturbance_bound)
+        check_disturbance_bound("disturbance_bound", disturbance_bound)
         pair, obstacle, blocked = (
             base + slope * disturbance_bound
             for base, slope in (_PAIR_MARGIN, _OBSTACLE_MARGIN, _BLOCKED_SPEED)

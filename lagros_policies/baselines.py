@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
-from lagros_envs.checks import check_positive, check_seed
+from lagros_envs.checks import check_positive, check_seed, shown
+from lagros_envs.conventions import settings_of
 from lagros_envs.dynamics import linearise_hold
+from lagros_envs.options import real_numbers
 from lagros_policies.observed import cartpole_rows
 
 FloatArray = NDArray[np.float64]
@@ -60,19 +62,21 @@ class LqrPolicy:
         except ImportError as error:
             raise ImportError("LqrPolicy needs SciPy: pip install 'lagros[policies]'") from error
         self.name = "lqr"
-        self.settings = settings or task.CartPoleSettings()
+        self.settings = settings_of(task.CartPoleSettings(), settings)
         if state_weights is None:
             ranges = [self.settings.goal_range or 1.0, self.settings.initial_angle or 1.0] * 2
             state_weights = [1.0 / (value * value) for value in ranges]
         if force_weight is None:
             force_weight = 1.0 / self.settings.force_scale**2
-        diagonal = np.asarray(state_weights, dtype=np.float64)
+        diagonal = real_numbers(state_weights)
         # Without a weight on p nothing brings the cart to its goal, and Riccati has no solution.
-        fits = diagonal.shape == (task.STATE_DIM,) and bool(np.all(np.isfinite(diagonal)))
-        if not (fits and np.all(diagonal >= 0.0) and diagonal[0] > 0.0):
+        fits = diagonal is not None and diagonal.shape == (task.STATE_DIM,)
+        if diagonal is None or not (
+            fits and np.isfinite(diagonal).all() and np.all(diagonal >= 0.0) and diagonal[0] > 0.0
+        ):
             raise ValueError(
-                f"state_weights={state_weights!r} must be {task.STATE_DIM} finite numbers >= 0, "
-                "the first > 0"
+                f"state_weights={shown(state_weights)} must be {task.STATE_DIM} finite numbers "
+                ">= 0, the first > 0"
             )
         check_positive("force_weight", force_weight)
         _, transition, effect = linearise_hold(
@@ -82,7 +86,13 @@ class LqrPolicy:
             self.settings.control_period,
         )
         weight = np.array([[force_weight]])
-        cost = solve_discrete_are(transition, effect, np.diag(diagonal), weight)
+        try:
+            cost = solve_discrete_are(transition, effect, np.diag(diagonal), weight)
+        except np.linalg.LinAlgError as error:
+            raise ValueError(
+                f"force_weight={force_weight:g} and state_weights={shown(state_weights)} differ so "
+                f"much that no gain is found: {error}"
+            ) from error
         self.gain: FloatArray = np.linalg.solve(
             weight + effect.T @ cost @ effect, effect.T @ cost @ transition
         )
@@ -123,7 +133,7 @@ class RandomPolicy:
     def __init__(self, settings: task.CartPoleSettings | None = None, seed: int = 0) -> None:
         """Seed the generator; see the class for the arguments."""
         self.name = "random"
-        self.settings = settings or task.CartPoleSettings()
+        self.settings = settings_of(task.CartPoleSettings(), settings)
         check_seed(seed)
         self._rng = np.random.default_rng(seed)
 

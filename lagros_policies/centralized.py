@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
+from lagros_envs.checks import check_instance
 from lagros_envs.dynamics.spacecraft import HEADING, SPIN
 from lagros_envs.scenarios import Preset
 from lagros_policies.contraction.double_integrator import planned_margin
@@ -152,7 +153,8 @@ class CentralizedPolicy:
         wanted = planned_margin(margin, disturbance_bound, contraction_rate)
         if planner is None:
             planner = planner_settings(self.settings, wanted, disturbance_bound)
-        elif planner.control_period != period or planner.mass != body.mass:
+        check_instance("planner", planner, SpacecraftPlannerSettings)
+        if planner.control_period != period or planner.mass != body.mass:
             raise ValueError(
                 f"the planner is for control_period={planner.control_period!r} and "
                 f"mass={planner.mass!r}; the task has {period!r} and {body.mass!r}"

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
-from lagros_envs.checks import check_not_negative, check_whole
+from lagros_envs.checks import check_instance, check_not_negative, check_whole
 from lagros_envs.observation import Layout
 from lagros_envs.scenarios import Preset
 from lagros_policies.contraction.double_integrator import planned_margin
@@ -146,7 +146,9 @@ class DistributedTubeMpcPolicy:
         self.replan_every, self.kept_for, self.smoothing = replan_every, kept_for, smoothing
         self.still = _STILL + _STILL_NOISE * disturbance_bound
         allowed = plan_force_limit(self.settings, disturbance_bound)
-        planner = planner or LocalPlannerSettings(mass=body.mass, force_limit=allowed)
+        if planner is None:
+            planner = LocalPlannerSettings(mass=body.mass, force_limit=allowed)
+        check_instance("planner", planner, LocalPlannerSettings)
         if planner.mass != body.mass:
             raise ValueError(
                 f"the planner is for mass={planner.mass!r}; the task has {body.mass!r}"

@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
+from lagros_envs.checks import check_positive
+from lagros_envs.conventions import settings_of
 from lagros_envs.dynamics import System
 from lagros_envs.scenarios import Preset
 from lagros_envs.spacecraft_task import SpacecraftSettings
@@ -75,7 +77,9 @@ class NeuralTubeMpcPolicy(TubeMpcPolicy):
     ) -> None:
         """Read the network and build planner and law."""
         if metric is None:
-            check_shipped_metric(settings or task.CartPoleSettings(), allow_other_settings)
+            check_shipped_metric(
+                settings_of(task.CartPoleSettings(), settings), allow_other_settings
+            )
         super().__init__(settings, load_neural_metric(metric), replan_every, deadline, clock)
 
 
@@ -201,6 +205,7 @@ class SlidingCentralizedPolicy(CentralizedPolicy):
         """Build planner and law."""
         super().__init__(settings, preset, num_agents, disturbance_bound, margin=margin)
         period = self.settings.control_period
+        check_positive("turning_rate", turning_rate)
         # It answers the calls of `WrenchTracking`, and a bound of its own comes with it.
         law: Any = SlidingTracking(
             self.settings.system,

@@ -10,6 +10,7 @@ from typing import Any, Literal, Protocol, TypeVar, cast, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_flag
 from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_policies.naming import UserClass, model_file, user_class
 from lagros_policies.wrappers import bare_environment
@@ -145,7 +146,14 @@ def make(
         TypeError: The environment is not one of this package.
         ImportError: A package that the policy needs is not installed.
     """
+    check_flag("allow_wrappers", allow_wrappers)
+    check_flag("allow_other_settings", allow_other_settings)
     world = bare_environment(env, allow_wrappers)
+    if "settings" in settings:
+        raise ValueError(
+            "settings are those of the environment: make the environment with them, or build the "
+            "class of the policy yourself"
+        )
     if isinstance(world.settings, SpacecraftSettings):
         classes = _SPACECRAFT
         settings = {"preset": world.preset, **settings}

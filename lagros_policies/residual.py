@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
+from lagros_envs.conventions import settings_of
 from lagros_policies.actor import Actor, ActorPolicy
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.policy import PolicyState
@@ -58,7 +59,7 @@ class ResidualPolicy:
         allow_other_settings: bool = False,
     ) -> None:
         """Load both networks; see the class for the arguments."""
-        self.settings = settings or task.CartPoleSettings()
+        self.settings = settings_of(task.CartPoleSettings(), settings)
         self.base = LagrosPolicy(self.settings, base, allow_other_settings)
         self.correction = Correction(self.settings, weights, allow_other_settings)
 

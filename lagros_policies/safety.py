@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
+from lagros_envs.checks import check_instance
 from lagros_envs.dynamics.spacecraft import HEADING, SPIN, VELOCITY_X
 from lagros_envs.observation import OBSTACLE_DIM, Layout
 from lagros_envs.scenarios import Preset
@@ -101,6 +102,7 @@ class SafetyFilter:
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
         chosen = BarrierSettings.for_bound(disturbance_bound) if barrier is None else barrier
+        check_instance("barrier", chosen, BarrierSettings)
         limit = self.settings.thrust_limit
         if limit is not None:
             # Two thrusters push along an axis; half of that is kept for the rest.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from lagros_envs.conventions import settings_of
 from lagros_envs.scenarios import Preset, preset_named
 from lagros_envs.spacecraft_task import SpacecraftSettings
 
@@ -27,9 +28,13 @@ def task_and_preset(
         The task, and the preset with that many agents.
 
     Raises:
-        ValueError: There is no such preset, or the number of agents is less than 1.
+        ValueError: The settings are none, there is no such preset, or the number of agents is less
+            than 1.
     """
-    return settings or SpacecraftSettings(), preset_named(preset).for_agents(num_agents)
+    return (
+        settings_of(SpacecraftSettings(), settings),
+        preset_named(preset).for_agents(num_agents),
+    )
 
 
 def plan_force_limit(settings: SpacecraftSettings, disturbance_bound: float) -> float | None:

@@ -13,6 +13,7 @@ from dataclasses import fields
 from typing import Any, Literal
 
 from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.checks import check_flag
 from lagros_envs.dynamics import CartPole
 from lagros_envs.reading import parse_json
 from lagros_envs.scenarios import Preset, preset_named
@@ -102,6 +103,7 @@ def check_trained_for(
         raise ValueError(
             f"{what} holds the policy {found[1]!r} of the {found[0]}, not {policy!r} of the {task}"
         )
+    check_flag("allow_other_settings", allow_other_settings)
     if allow_other_settings:
         return
     for name, value in _flown(flown).items():

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
-from lagros_envs.checks import check_above, check_whole
+from lagros_envs.checks import check_above, check_whole, shown
+from lagros_envs.conventions import settings_of
 from lagros_envs.dynamics import CartPole
 from lagros_policies.contraction import ContractionMetric, load_metric
 from lagros_policies.expert import CartPoleExpert, TrackedPlans
@@ -95,11 +96,15 @@ class TubeMpcPolicy:
         """Build planner and law."""
         check_whole("replan_every", replan_every)
         check_above("deadline", deadline, 0)
-        self.settings = settings or task.CartPoleSettings()
+        self.settings = settings_of(task.CartPoleSettings(), settings)
         if metric is None:
             check_shipped_metric(self.settings, allow_other_settings)
         if metric is None or isinstance(metric, str | Path):
             metric = load_metric(metric, task.STATE_DIM)
+        if not all(hasattr(metric, name) for name in ("contraction_rate", "condition_bound")):
+            raise ValueError(f"metric={shown(metric)} must be a contraction metric, or its file")
+        if not callable(clock):
+            raise ValueError(f"clock={shown(clock)} must be a function that returns seconds")
         self.expert = CartPoleExpert(metric, self.settings)
         self.replan_every = replan_every
         self.deadline = deadline

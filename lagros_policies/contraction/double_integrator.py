@@ -25,7 +25,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_not_negative, check_positive
+from lagros_envs.checks import check_disturbance_bound, check_not_negative, check_positive
 from lagros_policies.contraction.tube import Tube
 
 FloatArray = NDArray[np.float64]
@@ -259,7 +259,7 @@ def planned_margin(margin: float | None, disturbance_bound: float, rate: float) 
     Raises:
         ValueError: A value is negative or not finite.
     """
-    check_not_negative("disturbance_bound", disturbance_bound)
+    check_disturbance_bound("disturbance_bound", disturbance_bound)
     if margin is None:
         return max(_LEAST_MARGIN, expected_margin(disturbance_bound, rate))
     check_not_negative("margin", margin, "or None")

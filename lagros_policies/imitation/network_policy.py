@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs import cartpole_task as task
+from lagros_envs.conventions import settings_of
 from lagros_policies.imitation.features import FEATURES, cartpole_features
 from lagros_policies.imitation.networks import Mlp
 from lagros_policies.observed import cartpole_rows
@@ -52,8 +53,8 @@ class NetworkPolicy:
         allow_other_settings: bool = False,
     ) -> None:
         """Load the network."""
-        self.settings = settings or task.CartPoleSettings()
-        path = PRETRAINED / self.weights_file if weights is None else Path(weights)
+        self.settings = settings_of(task.CartPoleSettings(), settings)
+        path = PRETRAINED / self.weights_file if weights is None else weights
         self.network = Mlp.load(path)
         if self.network.inputs != len(FEATURES) or self.network.outputs != 1:
             raise ValueError(

@@ -526,19 +526,19 @@ WITH_COMPILED = [name for name in PLAIN if EVERY[name].cartpole or name in VECTO
 @pytest.mark.parametrize("name", WITH_COMPILED)
 def test_whether_to_compile_is_true_or_false(name, value):
     kind = type(bare(player(name).env))
-    with pytest.raises(ValueError, match="compiled=.* must be True or False"):
+    with pytest.raises(ValueError, match=r"compiled=.* must be True or False"):
         kind(compiled=value)
 
 
 @pytest.mark.parametrize("value", [2.0, True, "2", 0, -2, np.zeros(2)])
 @pytest.mark.parametrize("name", [CARTPOLE, SPACECRAFT])
 def test_worlds_are_counted_in_whole_numbers(name, value):
-    with pytest.raises(ValueError, match="num_envs=.* must be a whole number"):
+    with pytest.raises(ValueError, match=r"num_envs=.* must be a whole number"):
         gym.make_vec(name, num_envs=value)
 
 
 @pytest.mark.parametrize("value", ["same step", None, 3, [1], np.zeros(2)])
 @pytest.mark.parametrize("name", [CARTPOLE, SPACECRAFT])
 def test_a_mode_of_autoreset_is_known_or_refused(name, value):
-    with pytest.raises(ValueError, match="autoreset_mode=.* must be one of next_step, same_step"):
+    with pytest.raises(ValueError, match=r"autoreset_mode=.* must be one of next_step, same_step"):
         gym.make_vec(name, num_envs=2, autoreset_mode=value)

@@ -1,0 +1,97 @@
+"""Arguments of every policy that make no sense: one line that names them, whatever they are."""
+
+import inspect
+import math
+
+import numpy as np
+import pytest
+
+from lagros_policies import make
+from lagros_policies.policy import _CARTPOLE, _SPACECRAFT
+from lagros_policies.safety import SafetyFilter
+from tests.policies.test_objects import CARTPOLE, OPTIONS, SPACECRAFT, world
+
+# None of them is a value of any argument.
+SENSELESS = [math.nan, 1j, [1], np.zeros(2), object(), b"1", {"a": 1}, 10**400, -1, "\nx"]
+
+
+def kind_of(task, name):
+    places = _CARTPOLE if task == "cartpole" else _SPACECRAFT
+    module, _, attribute = places.get(name, name).partition(":")
+    return getattr(__import__(module, fromlist=[attribute]), attribute)
+
+
+def arguments(task, name):
+    return list(inspect.signature(kind_of(task, name)).parameters)
+
+
+POLICIES = [("cartpole", name) for name in CARTPOLE]
+POLICIES += [("spacecraft", name) for name in SPACECRAFT if "+" not in name]
+EACH = [(task, name, argument) for task, name in POLICIES for argument in arguments(task, name)]
+
+
+def refused(build, argument, value):
+    with pytest.raises((ValueError, FileNotFoundError)) as caught:
+        build()
+    text = str(caught.value)
+    assert "\n" not in text
+    # A file is named by its path.
+    path = isinstance(value, str) and repr(value) in text
+    assert path or any(word in text for word in (argument, "path of a file")), text
+
+
+@pytest.mark.parametrize(("task", "name", "argument"), EACH)
+def test_an_argument_that_makes_no_sense_is_refused_by_name(task, name, argument):
+    env = world(task)
+    for value in SENSELESS:
+        if argument == "replan_every" and value == 10**400:
+            continue  # a whole number: it plans once
+        if argument == "settings":
+            refused(lambda value=value: kind_of(task, name)(value), argument, value)
+        else:
+            refused(lambda value=value: make(name, env, **{argument: value}), argument, value)
+
+
+@pytest.mark.parametrize("permission", ["allow_wrappers", "allow_other_settings"])
+@pytest.mark.parametrize("value", ["no", "", 1, 0, None, [True]])
+def test_only_true_permits(permission, value):
+    for task, name in (("cartpole", "lqr"), ("spacecraft", "centralized"), ("cartpole", "lagros")):
+        with pytest.raises(ValueError, match=f"{permission}=.* must be True or False"):
+            make(name, world(task), **{permission: value})
+
+
+def test_settings_come_with_the_environment():
+    with pytest.raises(ValueError, match="settings are those of the environment"):
+        make("lqr", world("cartpole"), settings={"force_limit": 5.0})
+
+
+def test_a_class_takes_the_settings_that_an_environment_takes():
+    slow = kind_of("cartpole", "tube-mpc")({"time_limit": 3.0})
+    assert slow.settings.time_limit == 3.0
+    far = kind_of("spacecraft", "tube-mpc")({"thrust_limit": 0.5}, {"agents": 3})
+    assert (far.settings.thrust_limit, far.preset.agents) == (0.5, 3)
+
+
+def test_weights_of_a_regulator_that_have_no_gain_are_named():
+    with pytest.raises(ValueError, match=r"force_weight=1e\+300 .* no gain is found"):
+        make("lqr", world("cartpole"), force_weight=1e300)
+    with pytest.raises(ValueError, match=r"state_weights=.* must be 4 finite numbers"):
+        make("lqr", world("cartpole"), state_weights=["1"] * 4)
+
+
+@pytest.mark.parametrize("name", ["tube-mpc", "centralized", f"{OPTIONS}SlidingCentralizedPolicy"])
+def test_nothing_is_prepared_for_a_bound_that_no_world_has(name):
+    with pytest.raises(ValueError, match=r"disturbance_bound=1e\+300 must be .* at most"):
+        make(name, world("spacecraft"), disturbance_bound=1e300)
+
+
+def test_the_filter_is_for_a_policy_and_a_task():
+    policy = make("lagros", world("spacecraft"))
+    for settings in (3, "x", [1]):
+        with pytest.raises(ValueError, match="settings="):
+            SafetyFilter(policy, settings)
+    for bound in (-1, math.nan, "x", 1e300):
+        with pytest.raises(ValueError, match="disturbance_bound="):
+            SafetyFilter(policy, disturbance_bound=bound)
+    with pytest.raises(ValueError, match="barrier="):
+        SafetyFilter(policy, barrier=3)
