@@ -260,7 +260,9 @@ def test_threads_may_compile_at_once():
 @needs_numba
 @pytest.mark.parametrize("kind", ["none", "gust"])
 def test_a_compiled_environment_flies_the_same_episode(kind, hold):
-    envs = [gym.make("lagros/CartPole-v0", disturbance=kind, compiled=flag) for flag in (False, True)]
+    envs = [
+        gym.make("lagros/CartPole-v0", disturbance=kind, compiled=flag) for flag in (False, True)
+    ]
     for seed in (1, 2):
         observations = [env.reset(seed=seed)[0] for env in envs]
         for step in range(90):
