@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 
 from lagros_benchmarks.extras import install_hint
+from lagros_benchmarks.process import end_with_threads
 
 
 def main() -> None:
@@ -13,6 +14,9 @@ def main() -> None:
         from lagros_benchmarks.cli import app
 
         app(prog_name="lagros")
+    except SystemExit as ending:
+        end_with_threads(ending.code if isinstance(ending.code, int) else 1)
+        raise
     except ModuleNotFoundError as error:
         hint = install_hint(error)
         if not hint:

@@ -7,7 +7,7 @@ inside it, so that `lagros --help` answers at once.
 from __future__ import annotations
 
 import sys
-from contextlib import chdir, redirect_stdout
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,6 +19,7 @@ from lagros_benchmarks.data import data
 from lagros_benchmarks.export import export
 from lagros_benchmarks.extras import check_extra
 from lagros_benchmarks.outputs import check_outputs, policy_files
+from lagros_benchmarks.process import undone
 from lagros_benchmarks.streams import printing_failed
 from lagros_benchmarks.terminal import (
     Command,
@@ -351,7 +352,7 @@ def run_and_report(
         )
     try:
         # What policies print is not ours, and where they go is no matter.
-        with progress_bar() as progress, redirect_stdout(sys.stderr), chdir("."):
+        with progress_bar() as progress, redirect_stdout(sys.stderr), undone():
             run = run_benchmark(settings, progress=progress, kept=kept)
         rows = summarise(run)
         delivery = outputs.write(run, rows)

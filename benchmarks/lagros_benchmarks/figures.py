@@ -21,7 +21,7 @@ from lagros_benchmarks.canvas import (
     styles,
 )
 from lagros_benchmarks.experiment import Row
-from lagros_benchmarks.formats import by_condition, condition_title, raised_note, row_label
+from lagros_benchmarks.formats import by_condition, condition_title, figure_note, row_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -95,7 +95,7 @@ def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
     episodes = rows[0]["episodes"]
     axes.set_title(f"{condition_title(rows[0])}, {episodes} episodes", loc="left", fontsize=10)
     text = "lines: mean; bands: 10th to 90th percentile; a fall keeps its largest error"
-    caption(figure, text + raised_note(rows))
+    caption(figure, text + figure_note(rows))
     _label_ends(axes, labels)
     return save(figure, path)
 
@@ -137,7 +137,8 @@ def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
                 capsize=2,
                 linewidth=1.6,
                 elinewidth=1,
-                label=row_label(*own, longest=LONGEST_LABEL),
+                # Of all panels: one legend is about every kind.
+                label=row_label(*_of(rows, name), longest=LONGEST_LABEL),
             )
         axes.set_title(kind, loc="left", fontsize=10)
         axes.set(ylim=(-4, 104), yticks=(0, 25, 50, 75, 100))
@@ -147,7 +148,8 @@ def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
         elif index + columns >= len(kinds):
             # Shared axes label the last line only, where this column may have no panel.
             axes.tick_params(labelbottom=True)
-    figure.supxlabel("disturbance bound d̄  [state units/s]", fontsize=10)
+    note = figure_note(rows)
+    figure.supxlabel(f"disturbance bound d̄  [state units/s]{note}", fontsize=10)
     figure.supylabel("success [%], 95 % interval", fontsize=10)
     handles, names = panels[0].get_legend_handles_labels()
     look: dict[str, Any] = {"frameon": False, "handlelength": 3.5}
@@ -157,6 +159,10 @@ def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
         columns = min(len(names), 4)
         figure.legend(handles, names, loc="outside upper left", ncols=columns, **look)
     return save(figure, path)
+
+
+def _of(rows: Sequence[Row], policy: str) -> list[Row]:
+    return [row for row in rows if row["policy"] == policy]
 
 
 def _columns(panels: int) -> int:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib.util
 import json
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -92,8 +94,32 @@ def _module_files(module: str) -> list[Path]:
         return [path for place in found.submodule_search_locations for path in _files(Path(place))]
     if found.origin is None:
         return []
-    beside = Path(found.origin).parent.glob("*")
-    return sorted(path for path in beside if path.suffix in _BESIDE and path.is_file())
+    place = Path(found.origin).parent
+    beside = [path for path in place.glob("*") if path.suffix in _BESIDE and path.is_file()]
+    return sorted({*beside, *_packages_beside(place, beside)})
+
+
+def _packages_beside(place: Path, modules: Iterable[Path]) -> Iterator[Path]:
+    """Yield the files of the folders of a place that modules import from."""
+    names: set[str] = set()
+    for module in modules:
+        if module.suffix == ".py":
+            # What is no Python is said where it is imported.
+            with suppress(OSError, SyntaxError, ValueError, RecursionError, MemoryError):
+                for node in ast.walk(ast.parse(module.read_bytes())):
+                    names |= _imported(node)
+    for name in names:
+        if (place / name).is_dir():
+            yield from _files(place / name)
+
+
+def _imported(node: ast.AST) -> set[str]:
+    """Return the packages that a statement imports from."""
+    if isinstance(node, ast.Import):
+        return {alias.name.partition(".")[0] for alias in node.names}
+    if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+        return {node.module.partition(".")[0]}
+    return set()
 
 
 def _files(folder: Path) -> list[Path]:

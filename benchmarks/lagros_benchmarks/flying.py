@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.library import Policy, SetupError, describe_error
+from lagros_benchmarks.process import ProcessState, undone
 from lagros_envs.seeding import episode_streams
 
 Float32Array = NDArray[np.float32]
@@ -59,9 +60,11 @@ class Attempt:
         """Begin without an error."""
         self.error: str | None = None
         self._passing: tuple[type[BaseException], ...] = (KeyboardInterrupt, *passing)
+        self._process: ProcessState | None = None
 
     def __enter__(self) -> Attempt:
         """Begin."""
+        self._process = ProcessState()
         return self
 
     def __exit__(
@@ -71,6 +74,8 @@ class Attempt:
         trace: TracebackType | None,
     ) -> bool:
         """Write an exception down, SystemExit too; let KeyboardInterrupt pass."""
+        if self._process is not None:
+            self._process.restore()
         if error is None or isinstance(error, self._passing):
             return False
         self.error = describe_error(error)
@@ -119,7 +124,7 @@ def ask(
     if single.shape not in shapes:
         raise AnswerError(
             f"predict answered observations of shape {seen.shape} by an action of shape "
-            f"{single.shape}; it must be {' or '.join(map(str, shapes))}"
+            f"{single.shape}; it must be {' or '.join(map(str, dict.fromkeys(shapes)))}"
         )
     if not np.isfinite(single).all():
         at = np.flatnonzero(~np.isfinite(single.ravel()))[0]
@@ -184,8 +189,9 @@ def rehearse(
     """
     check_interface(what, policy)
     try:
-        reseed(policy, 0)
-        ask(policy, observation, None, starts, *shapes)
+        with undone():
+            reseed(policy, 0)
+            ask(policy, observation, None, starts, *shapes)
     except (AnswerError, ImportError) as error:
         raise SetupError(f"{what} cannot fly: {describe(error)}") from error
     except KeyboardInterrupt:

@@ -39,9 +39,24 @@ def mark(*rows: Row) -> str:
     return RAISED_MARK if any(row["errors"] or row.get("timing_raised") for row in rows) else ""
 
 
-def raised_note(rows: Sequence[Row]) -> str:
-    """Return what the mark means, for the end of a figure's caption; "" without one."""
-    return f"\n{RAISED_MARK} some episodes raised and count as failures" if mark(*rows) else ""
+def figure_note(rows: Sequence[Row]) -> str:
+    """Return what the mark and shared labels mean, for the end of a caption; "" without them."""
+    lines = names_lines(rows)
+    if mark(*rows):
+        lines.append(f"{RAISED_MARK} some episodes raised and count as failures")
+    return "".join(f"\n{line}" for line in lines)
+
+
+def names_lines(rows: Sequence[Row]) -> list[str]:
+    """Return a line for every label that several policies of a run share: who they are."""
+    shared: dict[str, list[str]] = {}
+    for policy in dict.fromkeys(row["policy"] for row in rows):
+        shared.setdefault(policy_label(policy), []).append(policy)
+    return [
+        f"{label}, always in this order: {', '.join(policies)}"
+        for label, policies in shared.items()
+        if len(policies) > 1
+    ]
 
 
 def raised_lines(rows: Sequence[Row]) -> list[str]:

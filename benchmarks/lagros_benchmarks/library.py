@@ -7,7 +7,7 @@ imports only what its chunk needs.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import chdir, contextmanager
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.claims import position_margin
+from lagros_benchmarks.process import undone
 
 FloatArray = NDArray[np.float64]
 Environment = gym.Env[Any, Any]
@@ -53,8 +54,12 @@ class SetupError(Exception):
         return cls(own if own.startswith(what) else f"{what} cannot be built: {text}")
 
 
+# What a policy may have beside `predict`.
+_OPTIONAL = ("name", "observes", "policy", "reseed", "counters", "bare_forward", "example_features")
+
+
 def check_observes(what: str, policy: Any) -> None:
-    """Check that a policy says rightly what it is fed, where it says it.
+    """Check that a policy says rightly what it is fed, where it says it, and what it has.
 
     Args:
         what: As for `SetupError.building`.
@@ -64,6 +69,8 @@ def check_observes(what: str, policy: Any) -> None:
         SetupError: It does not.
     """
     with building(what):
+        for name in _OPTIONAL:
+            getattr(policy, name, None)  # a property may raise
         observes = getattr(policy, "observes", "local")
         if observes not in ("local", "global"):
             raise SetupError(f'{what} has observes={observes!r}; it must be "local" or "global"')
@@ -80,7 +87,7 @@ def building(what: str) -> Iterator[None]:
         SetupError: Something was raised.
     """
     try:
-        with chdir("."):  # where a constructor goes, it goes for itself
+        with undone():  # where a constructor goes, it goes for itself
             yield
     except (KeyboardInterrupt, SetupError):
         raise
@@ -166,7 +173,8 @@ def make_single_policy(name: str, env: Any) -> Policy:
         ImportError: An extra that the policy needs is not installed.
     """
     try:
-        policy = make_policy(name, env, {})
+        with undone():
+            policy = make_policy(name, env, {})
         check_observes(f"policy {name!r}", policy)
         return policy
     except (SetupError, ValueError, OSError, ImportError, KeyboardInterrupt):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from contextlib import chdir, redirect_stdout
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lagros_benchmarks.outputs import Delivery, Paths, check_outputs
+from lagros_benchmarks.process import undone
 
 if TYPE_CHECKING:
     from lagros_benchmarks.experiment import BenchmarkRun, Row
@@ -123,7 +124,7 @@ def _draw_scene(run: BenchmarkRun, world: int, path: Path) -> None:
     from lagros_benchmarks.scene_figure import scene_figure
 
     # As in the run: what policies print is not ours, and where they go is no matter.
-    with redirect_stdout(sys.stderr), chdir("."):
+    with redirect_stdout(sys.stderr), undone():
         scene = fly_scene(run.settings, world)
     scene_figure(scene, path)
 

@@ -21,7 +21,7 @@ from lagros_benchmarks.canvas import (
     styles,
 )
 from lagros_benchmarks.experiment import Row
-from lagros_benchmarks.formats import disturbance_title, raised_note, row_label, task_title
+from lagros_benchmarks.formats import disturbance_title, figure_note, row_label, task_title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,7 +65,7 @@ def draw(rows: Sequence[Row], path: str | Path) -> Path:
     path = check_figure_path(path)
     if len({row["agents"] for row in rows}) > 1:
         return _scale_figure(rows, path)
-    if len({row["bound"] for row in rows}) > 1:
+    if len({(row["disturbance"], row["bound"]) for row in rows}) > 1:
         return _bound_figure(rows, path)
     return _policy_figure(rows, path)
 
@@ -92,7 +92,7 @@ def _bound_figure(rows: Sequence[Row], path: Path) -> Path:
     caption(
         figure,
         f"{task_title(first)}, {first['episodes']} worlds per point; success per agent; bands: "
-        "95 % intervals over worlds" + raised_note(rows),
+        "95 % intervals over worlds" + figure_note(rows),
     )
     _legend(figure, panels[0])
     return save(figure, path)
@@ -133,7 +133,7 @@ def _scale_figure(rows: Sequence[Row], path: Path) -> Path:
         figure,
         f"{first['task']}, {first['preset']}, {first['episodes']} worlds per point; success per "
         "agent; bands: 95 % intervals over worlds\ntime: filled, one agent's decision, or one plan "
-        "for all agents; open, per agent where one call decides for all" + raised_note(rows),
+        "for all agents; open, per agent where one call decides for all" + figure_note(rows),
     )
     _legend(figure, panels[0])
     return save(figure, path)
@@ -181,7 +181,7 @@ def _policy_figure(rows: Sequence[Row], path: Path) -> Path:
     caption(
         figure,
         "success per agent; bars: 95 % intervals over worlds; open: without, filled: with the "
-        "safety filter" + raised_note(rows),
+        "safety filter" + figure_note(rows),
     )
     return save(figure, path)
 

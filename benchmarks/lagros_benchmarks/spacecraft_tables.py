@@ -131,11 +131,9 @@ def sweeps(rows: Sequence[Row]) -> Iterator[tuple[str, list[str], list[list[str]
     number of agents against the bounds; where there are several numbers of agents, for each
     disturbance against these. Conditions that stand alone have none.
     """
-    scale = len({row["agents"] for row in rows}) > 1
-    for series in _series(rows, scale):
+    scale = _is_scale(rows)
+    for series in _series(rows):
         points = list(dict.fromkeys(_point(row, scale) for row in series))
-        if len(points) < 2:
-            continue
         for begin in range(0, len(points), _MOST_COLUMNS):
             part = points[begin : begin + _MOST_COLUMNS]
             shown = [row for row in series if _point(row, scale) in part]
@@ -143,13 +141,20 @@ def sweeps(rows: Sequence[Row]) -> Iterator[tuple[str, list[str], list[list[str]
                 yield _sweep(name, content, shown, part, scale)
 
 
-def _series(rows: Sequence[Row], scale: bool) -> list[list[Row]]:
-    """Group the rows that share a table of a sweep."""
+def _is_scale(rows: Sequence[Row]) -> bool:
+    """Return whether numbers of agents are compared, and not bounds."""
+    return len({row["agents"] for row in rows}) > 1
+
+
+def _series(rows: Sequence[Row]) -> list[list[Row]]:
+    """Group the rows that share a table of a sweep, without those of a condition alone."""
+    scale = _is_scale(rows)
 
     def key(row: Row) -> tuple[str, float | int]:
         return (row["disturbance"], row["bound"] if scale else row["agents"])
 
-    return [[row for row in rows if key(row) == one] for one in dict.fromkeys(map(key, rows))]
+    groups = [[row for row in rows if key(row) == one] for one in dict.fromkeys(map(key, rows))]
+    return [group for group in groups if len({_point(row, scale) for row in group}) > 1]
 
 
 def _point(row: Row, scale: bool) -> float:
@@ -201,14 +206,13 @@ _BATCH: Column = (
 
 
 def markdown_grids(groups: Sequence[Sequence[Row]]) -> list[str]:
-    """Return the tables of the sweeps as Markdown; the tables of conditions that stand alone."""
+    """Return the tables of the sweeps as Markdown, then those of conditions that stand alone."""
     rows = [row for group in groups for row in group]
     blocks = []
     for name, headings, contents in sweeps(rows):
         blocks += [name.replace("\n", ": "), markdown_table(headings, _trimmed(contents))]
-    if blocks:
-        return blocks
-    for group in groups:
+    swept = [row for series in _series(rows) for row in series]
+    for group in (group for group in groups if group[0] not in swept):
         headings = [f"{heading} [{unit}]" if unit else heading for heading, unit, _ in COLUMNS]
         lines = [[content(row) for _, _, content in COLUMNS] for row in ordered(group)]
         blocks += [condition_title(group[0]), markdown_table(headings, _trimmed(lines))]

@@ -13,6 +13,7 @@ from lagros_benchmarks.formats import (
     by_condition,
     condition_title,
     markdown_table,
+    names_lines,
     raised_lines,
 )
 
@@ -100,7 +101,8 @@ def _texts(row: Row) -> _Texts:
 
 
 def error_lines(rows: Sequence[Row], most: int = 5) -> Iterator[str]:
-    """Yield what raised: how many episodes of each policy, and the first few texts."""
+    """Yield which policies share a label and what raised: how many episodes, the first texts."""
+    yield from names_lines(rows)
     for row in rows:
         yield from raised_lines([row])
         errors = row["errors"]
@@ -173,7 +175,7 @@ def latex_text(rows: Sequence[Row]) -> str:
             ),
             r"\bottomrule",
             r"\end{tabular}",
-            *(rf"\par {_escape(line)}" for line in raised_lines(group)),
+            *(rf"\par {_escape(line)}" for line in (*names_lines(group), *raised_lines(group))),
         ]
     return "\n".join(blocks) + "\n"
 
@@ -184,7 +186,7 @@ def markdown_text(rows: Sequence[Row]) -> str:
     blocks = [f"    {' '.join(rows[0]['command'].split())}"] if rows else []
     if len(groups) > 1:
         grids = _texts(rows[0]).markdown_grids(groups)
-        return "\n\n".join([*blocks, *grids, *raised_lines(rows)]) + "\n"
+        return "\n\n".join([*blocks, *grids, *names_lines(rows), *raised_lines(rows)]) + "\n"
     for group in groups:
         shown = columns(group[0])
         units = [f"{heading} [{unit}]" if unit else heading for heading, unit, _ in shown]
@@ -192,7 +194,7 @@ def markdown_text(rows: Sequence[Row]) -> str:
         contents = [[content(row).strip() for _, _, content in shown] for row in ordered]
         blocks.append(markdown_table(units, contents))
         blocks += _markdown_lines(comparison_lines(group))
-        blocks += raised_lines(group)
+        blocks += [*names_lines(group), *raised_lines(group)]
     return "\n\n".join(blocks) + "\n"
 
 

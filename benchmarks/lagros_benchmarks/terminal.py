@@ -1,6 +1,6 @@
 """What the commands say on the terminal: errors without a traceback, lists, progress.
 
-Only the standard library, typer, `extras` and `streams` are imported here.
+Only the standard library, typer, `extras`, `process` and `streams` are imported here.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from lagros_benchmarks.extras import install_hint
+from lagros_benchmarks.process import no_exit
 from lagros_benchmarks.streams import patient_streams
 
 if TYPE_CHECKING:
@@ -72,6 +73,10 @@ class Command(TyperCommand):
 
     def invoke(self, context: Any) -> Any:
         """Run it."""
+        try:
+            os.getcwd()
+        except OSError:
+            fail("the folder that it was started in is no longer there; go to another", status=1)
         token = _CONTEXT.set(context)
         try:
             return super().invoke(context)
@@ -168,7 +173,7 @@ class Commands(TyperGroup):
 
     def main(self, *args: Any, **options: Any) -> Any:
         """Run a command; see `patient_streams` for what it prints."""
-        with patient_streams():
+        with patient_streams(), no_exit():
             return super().main(*args, **options)
 
     def invoke(self, context: Any) -> Any:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import os
+import sys
+import tempfile
 
 import numpy as np
 
@@ -119,6 +122,11 @@ class Leaves(Late):
         raise SystemExit(0)
 
 
+class Vanishes(Late):
+    def answer(self, seen, zero):
+        os._exit(0)
+
+
 class Closes(Late):
     def answer(self, seen, zero):
         raise GeneratorExit
@@ -196,6 +204,18 @@ class Unreadable(Calm):
         raise RuntimeError("not now")
 
 
+class Unseeded(Calm):
+    @property
+    def reseed(self):
+        raise RuntimeError("not now")
+
+
+class Nameless(Calm):
+    @property
+    def name(self):
+        raise RuntimeError("not now")
+
+
 class Alone(Calm):
     """Raises where it is asked for one agent alone, as for its time."""
 
@@ -206,18 +226,29 @@ class Alone(Calm):
 
 
 class Wanders(Calm):
-    """Goes to another folder, and makes NumPy raise, for the rest of the process."""
+    """Changes all that it can of the process, and its memory holds itself."""
 
     def __init__(self, settings, **others):
         super().__init__(settings, **others)
-        os.chdir("/")
+        self.leave()
 
     def answer(self, seen, zero):
         np.seterr(all="raise")
-        return zero, [self]  # and its memory holds itself
+        self.leave()
+        return zero, [self]
+
+    def leave(self):
+        folder = tempfile.mkdtemp()
+        os.chdir(folder)
+        os.rmdir(folder)
+        os.umask(0o777)
+        sys.argv[:] = ["another"]
+        sys.path.clear()
+        sys.setrecursionlimit(200)
+        sys.stdout = sys.stderr = io.StringIO()
 
 
 UNFIT = (NoPredict, NoKeywords, Unbuilt, Exits, NoPackage, NoPair, Triple, Nothing, Words, Wide)
-UNFIT += (Masked, Misnamed, Unreadable)
-FAILING = (Raises, Leaves, Closes, Recurses, Fills, Unspeakable, NotANumber, Infinite)
+UNFIT += (Masked, Misnamed, Unreadable, Unseeded, Nameless)
+FAILING = (Raises, Leaves, Vanishes, Closes, Recurses, Fills, Unspeakable, NotANumber, Infinite)
 FAILING += (LateNothing, LateTriple, LateWords, LateWide, AlwaysRaises)

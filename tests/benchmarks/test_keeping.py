@@ -247,6 +247,10 @@ def test_the_key_changes_with_all_that_a_result_depends_on(tmp_path, monkeypatch
     odd = tmp_path / "m:a=1.zip"
     for path in (model, module, metric, odd):
         path.write_text("1")
+    module.write_text("import os\nfrom gains.of_mine import GAIN\n\ndef late():\n    import gains2")
+    (tmp_path / "gains").mkdir()
+    (tmp_path / "gains2").mkdir()
+    (tmp_path / "more").mkdir()
     settings = BenchmarkSettings(
         policies=("lagros", "sac:m.zip", "ppo:m:a=1.zip", "pilots:Good"), metric="metric.json"
     )
@@ -265,8 +269,11 @@ def test_the_key_changes_with_all_that_a_result_depends_on(tmp_path, monkeypatch
         key(jobs=2),  # other processes contend for the one whose steps are timed
         fingerprint(settings, fakes.EASY),
     ]
-    weights = tmp_path / "weights.npz"
-    for path in (model, odd, module, metric, tmp_path / "helper.py", weights):
+    (tmp_path / "more" / "unrelated.py").write_text("1")
+    assert key() == first
+    imported = (tmp_path / "gains" / "of_mine.py", tmp_path / "gains2" / "weights.bin")
+    beside = (tmp_path / "helper.py", tmp_path / "weights.npz")
+    for path in (*imported, model, odd, metric, *beside, module):
         path.write_text("2")
         different.append(key())
     monkeypatch.setenv("OMP_NUM_THREADS", "7")

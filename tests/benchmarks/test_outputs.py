@@ -144,6 +144,24 @@ def test_the_paper_letters_its_methods():
     assert formats.policy_label("a_package.policies:Mine") == "Mine"
 
 
+def test_policies_of_one_label_are_told_apart(rows, grid_rows):
+    names = {"steady": "one:Good", "idle": "another.one:Good"}
+
+    def renamed(group):
+        text = json.dumps(group, default=float)
+        for before, after in names.items():
+            text = text.replace(f'"{before}"', f'"{after}"')
+        return json.loads(text)
+
+    said = "Good, always in this order: one:Good, another.one:Good"
+    for given in (renamed(grid_rows), renamed(rows)):
+        assert said in tables.error_lines(given)
+        assert said in tables.markdown_text(given)
+        assert said in tables.latex_text(given)
+        assert said in formats.figure_note(given)
+    assert not formats.names_lines(rows)
+
+
 def test_csv_has_a_line_per_row_and_no_curves(rows):
     read = list(csv.DictReader(io.StringIO(tables.csv_text(rows))))
     assert [line["policy"] for line in read] == list(POLICIES)

@@ -7,17 +7,20 @@ import dataclasses
 import functools
 import io
 import json
+import re
 
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from rich.cells import cell_len
 from rich.console import Console
 from rich.text import Text
 from typer.testing import CliRunner
 
-from lagros_benchmarks import cli, figures, files, formats, tables
+from lagros_benchmarks import cli, figures, files, formats, spacecraft_figures, tables
 from lagros_benchmarks.canvas import save
+from lagros_benchmarks.formats import percent
 from lagros_benchmarks.records import summarise
 from lagros_benchmarks.runner import fly_scene, run_benchmark
 from lagros_benchmarks.scene_figure import scene_figure
@@ -206,6 +209,26 @@ def test_csv_latex_and_markdown(sweep, scale):
     for rows in (sweep, scale, sweep[:8]):
         lines = [line for line in tables.markdown_text(rows).splitlines() if "|" in line[:1]]
         assert len(lines) >= 2 + len({row["policy"] for row in rows})
+
+
+@pytest.mark.parametrize("part", ["sweep", "kinds", "scale"])
+def test_every_condition_is_in_the_markdown_and_in_the_figure(
+    sweep, scale, part, tmp_path, monkeypatch
+):
+    calm = [{**row, "disturbance": "none", "bound": 0.0} for row in sweep[:8]]
+    gust = [{**row, "disturbance": "gust"} for row in sweep[:8]]
+    rows = {"sweep": [*calm, *sweep], "kinds": [*sweep[:8], *gust], "scale": scale}[part]
+    marked = [{**row, "success_rate": 0.001 * (at + 1)} for at, row in enumerate(rows)]
+    text = tables.markdown_text(marked)
+    for row in marked:
+        assert re.search(rf"\| {percent(row['success_rate'])} [±(]", text)
+    drawn = []
+    monkeypatch.setattr(Axes, "errorbar", lambda *_, **__: pytest.fail("conditions are mixed"))
+    monkeypatch.setattr(
+        spacecraft_figures, "_draw_lines", lambda _, part, *__: drawn.extend(map(id, part))
+    )
+    figures.draw(marked, tmp_path / "figure.png")
+    assert set(drawn) == set(map(id, marked))
 
 
 @pytest.mark.parametrize("part", ["sweep", "scale", "one"])

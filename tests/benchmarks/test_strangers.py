@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import stat
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -137,11 +140,33 @@ def test_what_raises_only_where_it_is_timed_is_told(invoke, tmp_path):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_a_policy_leaves_nothing_behind_in_the_process(invoke, tmp_path, task):
-    before = np.geterr()
-    assert invoke(*bench(task, strangers.Wanders)).exit_code == 0
-    assert (tmp_path / "out.json").is_file()
+    before, path = process_state(), set(sys.path)
+    result = invoke(*bench(task, strangers.Wanders))
+    assert result.exit_code == 0, result.output
+    assert "wrote out.json" in result.stdout
+    assert stat.S_IMODE((tmp_path / "out.json").stat().st_mode) == 0o666 & ~before[0]
+    (row,) = json.loads((tmp_path / "out.json").read_text())
+    assert "another" not in row["command"]
     assert os.path.samefile(".", tmp_path)
-    assert np.geterr() == before
+    assert process_state() == before
+    assert path <= set(sys.path)
+
+
+def process_state():
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask, np.geterr(), list(sys.argv), sys.getrecursionlimit(), os._exit
+
+
+def test_a_command_ends_though_a_thread_does_not():
+    program = """
+import threading, time
+from lagros_benchmarks import process
+process._PATIENCE = 0.1
+threading.Thread(target=time.sleep, args=(600,)).start()
+process.end_with_threads(3)
+"""
+    assert subprocess.run([sys.executable, "-c", program], timeout=60).returncode == 3
 
 
 def test_counters_that_raise_fail_their_episode(invoke, tmp_path):

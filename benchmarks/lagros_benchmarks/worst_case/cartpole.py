@@ -139,7 +139,7 @@ def policy_law(policy: Any, episodes: Episodes) -> Law:
             anything but one action for each row.
     """
     settings = episodes.settings
-    name = getattr(policy, "name", policy)
+    name = type(policy).__name__
 
     def asked(rows: NDArray[np.float32]) -> FloatArray:
         starts = np.ones(len(rows), bool)
@@ -147,11 +147,11 @@ def policy_law(policy: Any, episodes: Episodes) -> Law:
             answer = ask(policy, rows, None, starts, (len(rows), 1))
         except AnswerError as error:
             raise UnfitError(
-                f"policy {name!r}: {error}. A search flies many episodes at a time"
+                f"policy {name}: {error}. A search flies many episodes at a time"
             ) from error
         if answer.state is not None:
             raise UnfitError(
-                f"policy {name!r} keeps a memory; a search needs one that does not, or tube-mpc"
+                f"policy {name} keeps a memory; a search needs one that does not, or tube-mpc"
             )
         return _applied(settings, answer.action)
 
