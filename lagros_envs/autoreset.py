@@ -18,6 +18,7 @@ from lagros_envs.conventions import (
     Conforming,
     End,
     LimitedSettings,
+    check_started,
     check_step_limit,
     plain_seed,
     warned_after,
@@ -217,8 +218,7 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
         return self._observation(), self._info()
 
     def _need_start(self) -> None:
-        if not self._started:
-            raise RuntimeError("call reset() before step()")
+        check_started(self._started, "step()")
         if self._end is not End.NOT_YET:
             self._end = warned_after(self._end)
 

@@ -18,6 +18,7 @@ from lagros_envs.conventions import (
     Conforming,
     End,
     check_render_mode,
+    check_started,
     plain_seed,
     settings_of,
     warned_after,
@@ -138,6 +139,7 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
         self._renderer: Any = None
         self._started = False
+        self.nominal: FloatArray | None = None
         self._end = End.NOT_YET
 
     def reset(
@@ -167,14 +169,14 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         seed = plain_seed(seed)
         super().reset(seed=seed)
         drawn = self._draw(seed)
-        self.scenario = replace(drawn, **given) if given else drawn
+        self._scenario = replace(drawn, **given) if given else drawn
         self.nominal = nominal
-        self._state: tuple[float, ...] = tuple(self.scenario.initial_state.tolist())
-        self._goal: tuple[float, ...] = tuple(self.scenario.goal.tolist())
+        self._state: tuple[float, ...] = tuple(self._scenario.initial_state.tolist())
+        self._goal: tuple[float, ...] = tuple(self._scenario.goal.tolist())
         # What stays the same in every observation of the episode.
         self._blank = np.zeros(task.OBSERVATION_DIM, np.float32)
-        self._blank[task.GOAL] = self.scenario.goal
-        self._blank[task.INITIAL_STATE] = self.scenario.initial_state
+        self._blank[task.GOAL] = self._scenario.goal
+        self._blank[task.INITIAL_STATE] = self._scenario.initial_state
         self._step = 0
         self._effort = 0.0
         self._effort_to_success = 0.0
@@ -202,8 +204,7 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
             ValueError: The action is not one finite number.
             RuntimeError: The environment was not reset.
         """
-        if not self._started:
-            raise RuntimeError("call reset() before step()")
+        check_started(self._started, "step()")
         force = self._force(action)
         if self._end is not End.NOT_YET:
             self._end = warned_after(self._end)
@@ -224,13 +225,21 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         return self._observation(), reward, fallen, truncated, self._info(arrival, fallen)
 
     @property
+    def scenario(self) -> task.CartPoleScenario:
+        """The scenario of the episode."""
+        check_started(self._started, "scenario")
+        return self._scenario
+
+    @property
     def state(self) -> FloatArray:
         """The state x in double precision, shape (4,)."""
+        check_started(self._started, "state")
         return np.array(self._state)
 
     @property
     def time(self) -> float:
         """The time t [s]."""
+        check_started(self._started, "time")
         return self._step * self.settings.control_period
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -241,6 +250,7 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
                 'pass render_mode="rgb_array" to gym.make'
             )
             return None
+        check_started(self._started, "render()")
         if self._renderer is None:
             from lagros_envs.rendering import CartPoleRenderer
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lagros_envs import cartpole_task as task
 from lagros_envs.autoreset import RestartingVectorEnv, nominal_after
 from lagros_envs.checks import check_whole
-from lagros_envs.conventions import settings_of
+from lagros_envs.conventions import check_started, settings_of
 from lagros_envs.disturbances import Disturbance, Situation, channel_mask
 from lagros_envs.dynamics.held import HeldBatch
 from lagros_envs.options import checked_actions
@@ -186,6 +186,7 @@ class CartPoleVectorEnv(RestartingVectorEnv):
     @property
     def state(self) -> FloatArray:
         """The states x in double precision, shape (num_envs, 4)."""
+        check_started(self._started, "state")
         return np.array(self._kept[_STATE].T, order="C")
 
     @property

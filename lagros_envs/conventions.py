@@ -171,6 +171,24 @@ def check_render_mode(render_mode: str | None) -> str | None:
     return render_mode
 
 
+class NotStartedError(RuntimeError, AttributeError):
+    """Something of an episode was asked for before `reset`; to `hasattr` there is none."""
+
+
+def check_started(started: bool, what: str) -> None:
+    """Refuse what only an episode has.
+
+    Args:
+        started: Whether there is one.
+        what: What was asked for.
+
+    Raises:
+        NotStartedError: The environment was not reset.
+    """
+    if not started:
+        raise NotStartedError(f"call reset() before {what}")
+
+
 class End(Enum):
     """How far an episode is from its end."""
 

@@ -6,7 +6,7 @@ it was.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from lagros_envs.checks import LARGEST, shown, suggestion
 
 FloatArray = NDArray[np.float64]
+
+# Axes of any option.
+_DEEPEST = 4
 
 
 def known_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) -> dict[str, Any]:
@@ -51,6 +54,9 @@ def real_numbers(value: Any) -> FloatArray | None:
     """
     if isinstance(value, np.ma.MaskedArray):
         return None
+    # Among numbers in a list NumPy takes True for 1.
+    if isinstance(value, list | tuple) and _holds_flags(value):
+        return None
     try:
         array = np.asarray(value)
     # Whatever the object raises that says how to turn it into an array.
@@ -60,6 +66,18 @@ def real_numbers(value: Any) -> FloatArray | None:
         return None
     with np.errstate(over="ignore"):
         return array.astype(np.float64)
+
+
+def _holds_flags(values: Sequence[Any]) -> bool:
+    """Return whether True or False is in lists, however deep; no deeper than any array."""
+    left: list[tuple[Any, int]] = [(values, 0)]
+    while left:
+        one, depth = left.pop()
+        if isinstance(one, bool | np.bool_):
+            return True
+        if isinstance(one, list | tuple) and depth < _DEEPEST:
+            left += [(part, depth + 1) for part in one]
+    return False
 
 
 def option_numbers(

@@ -220,7 +220,7 @@ class SpacecraftParallelEnv(
             ValueError: An agent is missing or unknown, or an action is not eight finite numbers.
             RuntimeError: The environment was not reset.
         """
-        self.episode.need_start()
+        self.episode.need_start("step()")
         if not isinstance(actions, Mapping):
             raise ValueError(
                 f"the actions are {type(actions).__name__}; give a dictionary by agent"
@@ -245,22 +245,25 @@ class SpacecraftParallelEnv(
 
     def state(self) -> Float32Array:
         """Return the global state, laid out as `named_state_space` says."""
+        self.episode.need_start("state()")
         return cast(Float32Array, global_state(self.episode.world)[0])
 
     @property
     def states(self) -> FloatArray:
         """The states x of all agents in double precision, shape (agents, 6)."""
+        self.episode.need_start("states")
         return cast(FloatArray, self.episode.world.states[0])
 
     @property
     def scenario(self) -> Scenario:
         """The scenario of the episode."""
-        self.episode.need_start()
+        self.episode.need_start("scenario")
         return cast(Scenario, self.episode.world.scenarios[0])
 
     @property
     def time(self) -> float:
         """The time t [s]."""
+        self.episode.need_start("time")
         return float(self.episode.world.time[0])
 
     def _known(self, agent: str) -> str:

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from lagros_envs import spacecraft_task as task
-from lagros_envs.conventions import End, settings_of, warned_after
+from lagros_envs.conventions import End, check_started, settings_of, warned_after
 from lagros_envs.disturbances import Disturbance, channel_mask
 from lagros_envs.observation import Layout
 from lagros_envs.options import known_options
@@ -151,14 +151,9 @@ class SpacecraftEpisode:
                 'reset(options={"nominal": array of shape (steps + 1, agents, 6)})'
             )
 
-    def need_start(self) -> None:
-        """Refuse to step an environment that was not reset.
-
-        Raises:
-            RuntimeError: The environment was not reset.
-        """
-        if not self.started:
-            raise RuntimeError("call reset() before step()")
+    def need_start(self, what: str) -> None:
+        """Refuse what only an episode has; see `conventions.check_started`."""
+        check_started(self.started, what)
 
 
 class SpacecraftDrawing:
@@ -177,8 +172,7 @@ class SpacecraftDrawing:
                 'pass render_mode="rgb_array" to the constructor'
             )
             return None
-        if not self.episode.started:
-            raise RuntimeError("call reset() before render()")
+        self.episode.need_start("render()")
         if self._renderer is None:
             from lagros_envs.spacecraft_rendering import SpacecraftRenderer
 

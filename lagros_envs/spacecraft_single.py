@@ -113,7 +113,7 @@ class SpacecraftEnv(SpacecraftDrawing, Conforming, gym.Env[Float32Array, Float32
             ValueError: The action is not eight finite numbers.
             RuntimeError: The environment was not reset.
         """
-        self.episode.need_start()
+        self.episode.need_start("step()")
         values = checked_actions(action, (task.THRUSTERS,), task.ACTION)
         outcome = self.episode.step(task.applied_forces(self.settings, values)[None])
         if self.render_mode == "human":
@@ -129,17 +129,19 @@ class SpacecraftEnv(SpacecraftDrawing, Conforming, gym.Env[Float32Array, Float32
     @property
     def state(self) -> FloatArray:
         """The state x in double precision, shape (6,)."""
+        self.episode.need_start("state")
         return cast(FloatArray, self.episode.world.states[0, 0])
 
     @property
     def scenario(self) -> Scenario:
         """The scenario of the episode."""
-        self.episode.need_start()
+        self.episode.need_start("scenario")
         return cast(Scenario, self.episode.world.scenarios[0])
 
     @property
     def time(self) -> float:
         """The time t [s]."""
+        self.episode.need_start("time")
         return float(self.episode.world.time[0])
 
     def _observation(self) -> Float32Array:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lagros_envs import spacecraft_task as task
 from lagros_envs.autoreset import RestartingVectorEnv, nominal_after
 from lagros_envs.checks import check_whole
+from lagros_envs.conventions import check_started
 from lagros_envs.observation import (
     global_state,
     named_state_space,
@@ -156,16 +157,19 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
 
     def state(self) -> Float32Array:
         """Return the global state of every world, shape (worlds, size of `named_state_space`)."""
+        check_started(self._started, "state()")
         return global_state(self.world)
 
     @property
     def states(self) -> FloatArray:
         """The states x in double precision, shape (worlds, num_agents, 6)."""
+        check_started(self._started, "states")
         return self.world.states
 
     @property
     def scenarios(self) -> list[Scenario | None]:
         """The scenario of each world."""
+        check_started(self._started, "scenarios")
         return list(self.world.scenarios)
 
     def _checked(self, mask: BoolArray, options: dict[str, Any]) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from lagros_benchmarks.settings import BenchmarkSettings, Case
 from lagros_benchmarks.spacecraft_experiment import Scene, SpacecraftExperiment
 from lagros_benchmarks.spacecraft_experiment import fly_scene as fly_world
 from lagros_benchmarks.workers import Progress, gather, split
+from lagros_envs.checks import check_instance, shown
 from lagros_policies.backends import running
 
 __all__ = [
@@ -39,6 +40,7 @@ def make_experiment(settings: BenchmarkSettings, toolbox: Toolbox | None = None)
     Raises:
         SetupError: A policy, the planner or the metric cannot be built.
     """
+    check_instance("settings", settings, BenchmarkSettings)
     toolbox = toolbox or Toolbox()
     if settings.task == "cartpole":
         return CartPoleExperiment.set_up(settings, toolbox)
@@ -56,7 +58,11 @@ def kept_in(
         folder: Holds the folders of runs; need not be there.
         settings: Those of the run.
         toolbox: As for `run_benchmark`.
+
+    Raises:
+        ValueError: The settings are none.
     """
+    check_instance("settings", settings, BenchmarkSettings)
     key = fingerprint(settings, toolbox or Toolbox())
     return Kept(Path(folder) / f"{settings.task}-{key[:16]}", key)
 
@@ -96,10 +102,14 @@ def run_benchmark(
     Raises:
         SetupError: A policy, the planner or the metric cannot be built, or a policy cannot run.
             (What an episode raises is recorded as its failure instead.)
-        ValueError: An object has the name of a policy of this package, or comes with `kept`, which
+        ValueError: The settings are none; the policies are no dictionary; an object has the name of
+            a policy of this package or one that is no single line, or comes with `kept`, which
             cannot tell one object from another; or `kept` is of other settings.
         BackendError: The backend is not installed, not reachable, or loses its workers.
     """
+    check_instance("settings", settings, BenchmarkSettings)
+    if kept is not None:
+        check_instance("kept", kept, Kept, otherwise="as kept_in gives, or None")
     if policies:
         if kept is not None:
             raise ValueError("kept= cannot tell policies that are objects apart; leave it out")
@@ -146,7 +156,15 @@ def _with_policies(
     from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
 
     taken = NAMES if settings.task == "cartpole" else SPACECRAFT_NAMES
+    if not isinstance(policies, Mapping):
+        raise ValueError(f"policies={shown(policies)} must be a dictionary of objects by name")
     for name in policies:
+        plain = isinstance(name, str) and name.isprintable() and name and name == name.strip()
+        if not plain or name.endswith("+filter"):
+            raise ValueError(
+                f"policies: {shown(name)} is no name; take text of one line, which does not end in "
+                "+filter"
+            )
         if name in taken:
             raise ValueError(f"policies: {name!r} is a policy of this package; take another name")
     names = dict.fromkeys((*settings.policies, *policies))

@@ -10,15 +10,15 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
-from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from lagros_benchmarks.sb3_vector import world_seeds
+from lagros_benchmarks.sb3_vector import AlikeVecEnv, world_seeds
+from lagros_envs.checks import shown
 
 Indices = int | Iterable[int] | None
 
 
-class ParallelVecEnv(VecEnv):
+class ParallelVecEnv(AlikeVecEnv):
     """Parallel environments whose agents stay together, for one policy that all agents share.
 
     Row `world * agents + agent` is that agent of that world: row for row what `SB3VectorEnv` over
@@ -44,6 +44,12 @@ class ParallelVecEnv(VecEnv):
         self.worlds: list[Any] = list(worlds) if isinstance(worlds, Sequence) else [worlds]
         if not self.worlds:
             raise ValueError("worlds is empty; give at least one parallel environment")
+        for index, world in enumerate(self.worlds):
+            if not hasattr(world, "possible_agents"):
+                raise ValueError(
+                    f"world {index} is {shown(world)}; it must be a parallel environment, such as "
+                    "lagros_envs.spacecraft_v0.parallel_env()"
+                )
         first = self.worlds[0]
         self.agents = list(first.possible_agents)
         name = self.agents[0]

@@ -13,16 +13,41 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from lagros_envs.checks import shown
+from lagros_envs.conventions import plain_seed
+
 Indices = int | Iterable[int] | None
 
 
 def world_seeds(seed: int | None, worlds: int) -> list[int]:
-    """Return seed, seed + 1, ... for the worlds; from a random one if there is none."""
-    first = int(np.random.default_rng().integers(2**32)) if seed is None else int(seed)
+    """Return seed, seed + 1, ... for the worlds; from a random one if there is none.
+
+    Raises:
+        ValueError: The seed is not a non-negative integer.
+    """
+    given = plain_seed(seed)
+    first = int(np.random.default_rng().integers(2**32)) if given is None else given
     return list(range(first, first + worlds))
 
 
-class SB3VectorEnv(VecEnv):
+class AlikeVecEnv(VecEnv):
+    """What our `VecEnv`s share: their worlds are started alike."""
+
+    def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
+        """Refuse options for the next reset, which the worlds would not get.
+
+        Raises:
+            ValueError: There are options.
+        """
+        if options and any(options if isinstance(options, list) else [options]):
+            raise ValueError(
+                f"options={shown(options)}: {type(self).__name__} starts its worlds without "
+                "options; give the environment other settings, or reset it yourself"
+            )
+        super().set_options(options)
+
+
+class SB3VectorEnv(AlikeVecEnv):
     """A Gymnasium vector environment in same-step autoreset mode, as stable-baselines3 wants it.
 
     Where an episode ends, the info of that world holds what stable-baselines3 reads there:
@@ -35,11 +60,16 @@ class SB3VectorEnv(VecEnv):
         venv: The environment, with `autoreset_mode="same_step"` and flat Box spaces.
 
     Raises:
-        ValueError: The environment resets in another mode.
+        ValueError: It is no vector environment, or resets in another mode.
     """
 
     def __init__(self, venv: gym.vector.VectorEnv[Any, Any, Any]) -> None:
         """Wrap the environment; see the class."""
+        if not isinstance(venv, gym.vector.VectorEnv):
+            raise ValueError(
+                f"venv={shown(venv)} must be a vector environment, such as gym.make_vec("
+                '"lagros/CartPole-v0", num_envs=64, autoreset_mode="same_step")'
+            )
         mode = venv.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(

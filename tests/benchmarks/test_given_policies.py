@@ -88,5 +88,26 @@ def test_what_is_no_policy_is_refused_before_the_first_episode(tmp_path):
         run_benchmark(settings_of("mine"), kept=kept, policies={"mine": fakes.IdlePolicy()})
 
 
+@pytest.mark.parametrize("name", [1, None, "", " ", " mine", "mi\nne", "mine\x1b", "lqr+filter"])
+def test_an_object_has_a_name_that_a_table_can_hold(name):
+    with pytest.raises(ValueError, match=r"policies: .* is no name; take text of one line"):
+        run_benchmark(settings_of("lqr"), fakes.EASY, policies={name: fakes.IdlePolicy()})
+
+
+@pytest.mark.parametrize("policies", [[fakes.IdlePolicy()], fakes.IdlePolicy(), "mine"])
+def test_objects_come_by_name(policies):
+    with pytest.raises(ValueError, match=r"policies=.* must be a dictionary"):
+        run_benchmark(settings_of("lqr"), fakes.EASY, policies=policies)
+
+
+@pytest.mark.parametrize("settings", [None, {"episodes": 2}, "lqr"])
+def test_what_are_no_settings_is_said_in_one_line(settings, tmp_path):
+    for run in (run_benchmark, lambda settings: kept_in(tmp_path, settings)):
+        with pytest.raises(ValueError, match=r"settings=.* must be a BenchmarkSettings$"):
+            run(settings)
+    with pytest.raises(ValueError, match=r"kept=.* must be a Kept, as kept_in gives"):
+        run_benchmark(settings_of("lqr"), fakes.EASY, kept="folder")
+
+
 def test_the_package_says_that_it_is_typed():
     assert resources.files("lagros_benchmarks").joinpath("py.typed").is_file()

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from lagros_benchmarks.sb3_parallel import ParallelVecEnv
 from lagros_benchmarks.sb3_vector import SB3VectorEnv
 from lagros_envs import spacecraft_v0
+from lagros_envs.cartpole import CartPoleEnv
 from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
 
@@ -34,6 +35,32 @@ def batched(worlds=WORLDS, agents=AGENTS, **options):
     return SB3VectorEnv(
         SpacecraftVectorEnv(worlds * agents, agents, autoreset_mode="same_step", **options)
     )
+
+
+@pytest.mark.parametrize("build", [parallel, batched])
+def test_options_that_no_world_would_get_are_refused(build):
+    env = build()
+    for options in ({"goal": 1.0}, [{}, {"goal": 1.0}]):
+        with pytest.raises(ValueError, match="starts its worlds without options"):
+            env.set_options(options)
+    env.set_options()
+    env.set_options([{}] * env.num_envs)
+    env.reset()
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "3", True, 1 << 200])
+@pytest.mark.parametrize("build", [parallel, batched])
+def test_seeds_that_are_none_are_refused(build, seed):
+    with pytest.raises(ValueError, match=r"seed=.* must be a non-negative integer"):
+        build().seed(seed)
+
+
+@pytest.mark.parametrize("thing", [None, 3, "lagros/CartPole-v0", [object()], CartPoleEnv()])
+def test_what_is_no_environment_of_many_is_refused(thing):
+    with pytest.raises(ValueError, match="must be a vector environment"):
+        SB3VectorEnv(thing)
+    with pytest.raises(ValueError, match="must be a parallel environment"):
+        ParallelVecEnv(thing)
 
 
 def test_rows_are_those_of_the_batched_world():

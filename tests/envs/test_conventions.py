@@ -59,6 +59,7 @@ BAD_OPTIONS = [
     ({"initial_state": NUMBERS, "goal": -1e10}, r"options\['goal'\] holds -1e\+10"),
     ({"initial_state": NUMBERS, "goal": math.nan}, r"options\['goal'\] holds nan"),
     ({"initial_state": NUMBERS, "goal": True}, r"options\['goal'\]=True"),
+    ({"goal": 1.0, "initial_state": [True, 0, 0, 0]}, r"options\['initial_state'\]=\[.*True, 0"),
     ({"initial_state": NUMBERS, "goal": None}, r"options\['goal'\]=None"),
     ({"initial_state": NUMBERS, "goal": 1j}, r"options\['goal'\]=1j"),
     ({"initial_state": NUMBERS, "goal": np.ma.masked}, r"options\['goal'\]=masked"),
@@ -131,6 +132,28 @@ def test_a_first_reset_that_is_refused_starts_nothing(name):
         return  # wrappers of others believe that it was reset
     with pytest.raises(RuntimeError, match="call reset"):
         one.env.step(one.action(np.random.default_rng(0)))
+
+
+@pytest.mark.parametrize("name", [name for name in PLAIN if "make" not in name])
+def test_what_only_an_episode_has_is_not_there_before_one(name):
+    one = player(name)
+    env = one.env.unwrapped
+    of_episode = ("state", "states", "time", "scenario", "scenarios", "render")
+    found = [what for what in of_episode if hasattr(type(env), what)]
+    assert len(found) > 1
+    for what in found:
+        if what == "render" and not env.metadata["render_modes"]:
+            continue
+        method = callable(getattr(type(env), what))
+        if what == "render":
+            env.render_mode = "rgb_array"
+        with pytest.raises(RuntimeError, match=rf"call reset\(\) before {what}"):
+            getattr(env, what)() if method else getattr(env, what)
+        assert method == hasattr(env, what)
+    one.reset(seed=0)
+    for what in found:
+        value = getattr(env, what)
+        assert value() is not None if callable(value) and what != "render" else value is not None
 
 
 # Seeds.
