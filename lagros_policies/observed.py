@@ -21,7 +21,7 @@ def as_numbers(observation: Any, dtype: type[Number]) -> NDArray[Number]:
     """Return an observation as an array; it is not copied where it is one already.
 
     Raises:
-        ValueError: It is not made of numbers: text, truth values, objects and masked arrays are not.
+        ValueError: It is not made of numbers, as text, truth values and masked arrays are not.
     """
     if type(observation) is np.ndarray and observation.dtype.char in "fd":
         return np.asarray(observation, dtype)
