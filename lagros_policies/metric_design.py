@@ -19,6 +19,7 @@ from lagros_policies.contraction import (
     design_on_pool,
     verify_metric,
 )
+from lagros_policies.contraction.regions import joined
 from lagros_policies.planning import CartPolePlanner
 
 FloatArray = NDArray[np.float64]
@@ -120,11 +121,7 @@ def tube_samples(
         inside = settings.region.contains(triples.state, triples.nominal, triples.nominal_control)
         parts.append(triples.take(np.flatnonzero(inside)[: count - kept]))
         kept += len(parts[-1].state)
-    return Samples(
-        np.concatenate([part.state for part in parts]),
-        np.concatenate([part.nominal for part in parts]),
-        np.concatenate([part.nominal_control for part in parts]),
-    )
+    return joined(*parts)
 
 
 def _draw(

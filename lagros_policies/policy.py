@@ -10,7 +10,7 @@ from typing import Any, Literal, Protocol, TypeVar, cast, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_flag, shown
+from lagros_envs.checks import check_flag
 from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_policies.naming import UserClass, model_file, user_class
 from lagros_policies.wrappers import bare_environment
@@ -102,8 +102,6 @@ def row_memories(
             "or None at the start of an episode"
         )
     starts = np.zeros(count, bool) if episode_start is None else np.ravel(episode_start)
-    if starts.dtype.kind not in "biuf":
-        raise ValueError(f"episode_start={shown(episode_start)} must be True or False for each row")
     if len(memories) != count or len(starts) != count:
         raise ValueError(
             f"state remembers {len(memories)} {rows} and episode_start is for {len(starts)}; "

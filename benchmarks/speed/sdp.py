@@ -22,7 +22,7 @@ from lagros_policies.contraction import (
     load_metric,
     robust_control,
 )
-from lagros_policies.contraction.metric import basis, basis_rate
+from lagros_policies.contraction.basis import cosine_powers, cosine_rates
 from lagros_policies.metric_design import MetricDesignSettings, tube_samples
 from speed.report import Row, Section, Target, timed_row
 from speed.timing import Scale, interleave
@@ -145,8 +145,8 @@ def _state_and_solve(
     )
     slopes = slopes * scale[:, None] / scale[None, :]
     gains = control_matrix(system, samples.state) * scale[:, None]
-    powers = basis(samples.state[:, ANGLE], settings.degree)
-    rates = basis_rate(samples.state[:, ANGLE], samples.state[:, ANGULAR_RATE], settings.degree)
+    powers = cosine_powers(samples.state[:, ANGLE], settings.degree)
+    rates = cosine_rates(samples.state[:, ANGLE], samples.state[:, ANGULAR_RATE], settings.degree)
     coefficients = [cp.Variable((n, n), symmetric=True) for _ in range(settings.degree + 1)]
     weight, condition = cp.Variable(), cp.Variable()
     decay = 2.0 * (settings.contraction_rate + settings.margin)
@@ -160,7 +160,7 @@ def _state_and_solve(
         product = slope @ dual
         left = product + product.T - combined(rate) + decay * dual
         constraints.append(left - 2.0 * weight * (gain @ gain.T) << 0)
-    for power in basis(_bound_angles(region, settings), settings.degree):
+    for power in cosine_powers(_bound_angles(region, settings), settings.degree):
         dual = combined(power)
         constraints += [dual >> np.eye(n), dual << condition * np.eye(n)]
     problem = cp.Problem(cp.Minimize(condition + settings.control_penalty * weight), constraints)
@@ -180,7 +180,7 @@ def _cost(
     coefficients: FloatArray, weight: float, region: Region, settings: CvStemSettings
 ) -> float:
     """Return chi + lambda nu of W_bar in scaled states and nu, whatever their common scale."""
-    powers = basis(_bound_angles(region, settings), settings.degree)
+    powers = cosine_powers(_bound_angles(region, settings), settings.degree)
     eigenvalues = np.linalg.eigvalsh(np.einsum("ai,ijk->ajk", powers, coefficients))
     least = float(eigenvalues.min())
     return float(eigenvalues.max()) / least + settings.control_penalty * weight / least

@@ -33,7 +33,8 @@ from numpy.typing import NDArray
 from lagros_envs.dynamics import System, hold_control_slope, vector_field
 from lagros_envs.dynamics.cartpole import VELOCITY
 from lagros_policies.contraction.control import HeldControl
-from lagros_policies.contraction.metric import at_angles, matrices_at
+from lagros_policies.contraction.metric import matrices_at, region_angle
+from lagros_policies.contraction.places import at_angles
 from lagros_policies.contraction.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]
@@ -192,7 +193,7 @@ def largest_gain(
     if not reach or not min(reach) > 0.0 or not 0.0 < share < 1.0:
         raise ValueError(f"{reach=!r} must be > 0 and {share=!r} in (0, 1)")
     check_cartpole(law.system, "largest_gain")
-    angles = np.linspace(0.0, law.metric.region.angle, _GRID)
+    angles = np.linspace(0.0, region_angle(law.metric), _GRID)
     states = at_angles(angles, law.system.state_dim)
     _, push = hold_control_slope(law.system, states, np.zeros((_GRID, 1)), law.period)
     stiffness = np.einsum("si,sij,sj->s", push, matrices_at(law.metric, angles), push).max()

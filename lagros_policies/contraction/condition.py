@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
 from typing import TypeVar
 
 import numpy as np
@@ -14,52 +13,29 @@ from lagros_envs.dynamics import (
     state_dependent_coefficient,
     vector_field,
 )
-from lagros_policies.contraction.metric import ContractionMetric, DualMetric, Verification
-from lagros_policies.contraction.systems import check_angle, check_sizes
+from lagros_policies.contraction.metric import (
+    ContractionMetric,
+    DualMetric,
+    Verification,
+    metric_place,
+)
+from lagros_policies.contraction.regions import Samples, search_region
+from lagros_policies.contraction.systems import check_sizes, check_unmoved
+
+__all__ = [
+    "Samples",
+    "condition_left",
+    "condition_terms",
+    "contraction_residual",
+    "search_violation",
+    "verify_metric",
+]
 
 FloatArray = NDArray[np.float64]
 Verified = TypeVar("Verified", bound=ContractionMetric)
 
 # How well A e must give the difference of the motions, of which A is the mean slope.
 _SLOPE_ERROR = 1e-6
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Triples at which the condition is imposed or checked.
-
-    Attributes:
-        state: x, shape (s, n).
-        nominal: x_d, shape (s, n).
-        nominal_control: u_d, shape (s, m).
-
-    Raises:
-        ValueError: The shapes do not fit each other, or a number is not finite.
-    """
-
-    state: FloatArray
-    nominal: FloatArray
-    nominal_control: FloatArray
-
-    def __post_init__(self) -> None:
-        """Check shapes and numbers."""
-        shapes = [np.shape(getattr(self, item.name)) for item in fields(self)]
-        if (
-            [len(shape) for shape in shapes] != [2, 2, 2]
-            or shapes[0] != shapes[1]
-            or shapes[0][0] != shapes[2][0]
-        ):
-            raise ValueError(
-                f"state, nominal and nominal_control of shapes {shapes} must be (s, n), (s, n) and "
-                "(s, m)"
-            )
-        for item in fields(self):
-            if not np.all(np.isfinite(getattr(self, item.name))):
-                raise ValueError(f"{item.name} must be finite: leave such samples out")
-
-    def take(self, index: NDArray[np.intp]) -> Samples:
-        """Return the samples with these indices."""
-        return Samples(self.state[index], self.nominal[index], self.nominal_control[index])
 
 
 def condition_terms(system: System, samples: Samples) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -109,13 +85,15 @@ def condition_left(
         ValueError: The three are not of one system.
     """
     slope, gain, motion = condition_terms(system, samples)
-    if getattr(metric, "depends_on_angle", False):
-        check_angle(system, samples.state, motion, gain)
-    dual = metric.dual(samples.state)
+    place = _place(metric, samples)
+    dual = metric.dual(place)
     check_sizes(system, dual=(dual, slope.shape[-2:]))
+    check_unmoved(system, metric, samples.state, gain)
+    if place is samples.nominal:
+        motion = vector_field(system, place, samples.nominal_control)
     product = slope @ dual
     left: FloatArray = (
-        -metric.dual_rate(samples.state)
+        -metric.dual_rate(place, motion)
         + product
         + np.swapaxes(product, -1, -2)
         - 2.0 * share * metric.control_weight * gain @ np.swapaxes(gain, -1, -2)
@@ -133,14 +111,14 @@ def contraction_residual(system: System, metric: DualMetric, samples: Samples) -
 
     Args:
         system: The system.
-        metric: W_bar; one of the angle for a system whose state 1 moves at the rate of state 3.
+        metric: W_bar; one of x only where no control of the system moves it.
         samples: Where to look.
 
     Raises:
         ValueError: The three are not of one system.
     """
     left = condition_left(system, metric, samples)
-    values, vectors = np.linalg.eigh(metric.dual(samples.state))
+    values, vectors = np.linalg.eigh(metric.dual(_place(metric, samples)))
     # Where it is not a metric at all no residual is large enough.
     definite = values[:, 0] > 0.0
     size = np.sqrt(np.where(definite[:, None], values, 1.0))
@@ -167,7 +145,9 @@ def verify_metric(system: System, metric: Verified, samples: Samples, seed: int)
     if len(samples.state) == 0:
         raise ValueError("samples are empty: nothing would be verified")
     residual = contraction_residual(system, metric, samples)
-    scaled = metric.dual(samples.state) * metric.scaling[:, None] * metric.scaling[None, :]
+    scaled = (
+        metric.dual(_place(metric, samples)) * metric.scaling[:, None] * metric.scaling[None, :]
+    )
     eigenvalues = np.linalg.eigvalsh(scaled)
     # The semidefinite solver meets the bounds to about 1e-7 of chi.
     slack = 1e-6 * metric.condition_bound
@@ -176,3 +156,29 @@ def verify_metric(system: System, metric: Verified, samples: Samples, seed: int)
     )
     broken = int(np.sum(~(residual <= 0.0) | ~bounded))
     return metric.verified(Verification(len(residual), broken, float(residual.max()), seed))
+
+
+def search_violation(system: System, metric: ContractionMetric, seed: int) -> tuple[Samples, float]:
+    """Look for where the condition fails most on a metric's own region (observed).
+
+    Unlike `verify_metric` it follows the worst triples that it drew to where they are worse.
+
+    Args:
+        system: The system.
+        metric: The metric.
+        seed: Seed of the search.
+
+    Returns:
+        The triples that the search ended at, the worst first, and the `contraction_residual` of
+        that one [1/s]: where it is positive the metric does not contract.
+    """
+    found, figures = search_region(
+        metric.region,
+        lambda drawn: contraction_residual(system, metric, drawn),
+        np.random.default_rng(seed),
+    )
+    return found, float(figures[0])
+
+
+def _place(metric: DualMetric, samples: Samples) -> FloatArray:
+    return metric_place(metric, samples.state, samples.nominal)

@@ -16,8 +16,8 @@ from lagros_envs.dynamics import (
     linearise_hold,
     vector_field,
 )
-from lagros_policies.contraction.metric import ContractionMetric
-from lagros_policies.contraction.systems import check_angle, check_sizes
+from lagros_policies.contraction.metric import ContractionMetric, metric_place
+from lagros_policies.contraction.systems import check_sizes, check_unmoved
 
 FloatArray = NDArray[np.float64]
 
@@ -67,15 +67,18 @@ def contraction_terms(
         nominal_control=(nominal_control, (m,)),
     )
     error = state - nominal
-    matrix, gain = metric.matrix(state), control_matrix(system, state)
+    place = metric_place(metric, state, nominal)
+    matrix, gain = metric.matrix(place), control_matrix(system, state)
     check_sizes(system, metric=(matrix, (n, n)))
+    check_unmoved(system, metric, state, gain)
     pull = np.einsum("...ij,...j->...i", matrix, error)
     motion = vector_field(system, state, nominal_control)
-    if getattr(metric, "depends_on_angle", False):
-        check_angle(system, state, motion, gain)
-    drift = motion - vector_field(system, nominal, nominal_control)
+    planned = vector_field(system, nominal, nominal_control)
+    drift = motion - planned
     phi_0 = 2.0 * np.einsum("...i,...i->...", pull, drift + rate * error)
-    phi_0 = phi_0 + error_energy(metric.matrix_rate(state), error)
+    phi_0 = phi_0 + error_energy(
+        metric.matrix_rate(place, planned if place is nominal else motion), error
+    )
     phi_1 = 2.0 * np.einsum("...ij,...i->...j", gain, pull)
     return phi_0, phi_1
 
@@ -122,9 +125,10 @@ class HeldControl:
 
         (e' + G v)' M(x') (e' + G v) <= exp(-2 alpha dt) e'Me,  e' = F(x, u_d) - F(x_d, u_d),
 
-    G = dF/du(x, u_d), x' = F(x, u_d). That is an ellipsoid of v, with one control an interval,
-    whose point nearest to the preferred v is taken: for a preferred v of zero the least deviation,
-    as in (17). Where it is empty, outside the metric's region, the v of least energy is taken.
+    G = dF/du(x, u_d), x' = F(x, u_d); a metric of x_d is taken at x_d and at F(x_d, u_d). That is
+    an ellipsoid of v, with one control an interval, whose point nearest to the preferred v is
+    taken: for a preferred v of zero the least deviation, as in (17). Where it is empty, outside the
+    metric's region, the v of least energy is taken.
 
     Attributes:
         system: The system.
@@ -174,12 +178,14 @@ class HeldControl:
             gain = slope[..., None]
         else:
             following, _, gain = linearise_hold(self.system, state, nominal_control, self.period)
-        error = following - hold_step(self.system, nominal, nominal_control, self.period)
-        matrix = self.metric.matrix(following)
+        planned = hold_step(self.system, nominal, nominal_control, self.period)
+        error = following - planned
+        matrix = self.metric.matrix(metric_place(self.metric, following, planned))
         pull = np.einsum("...ij,...jk->...ik", matrix, gain)
         a = np.einsum("...ij,...ik->...jk", gain, pull)
         b = np.einsum("...i,...ij->...j", error, pull)
-        before = error_energy(self.metric.matrix(state), state - nominal)
+        here = self.metric.matrix(metric_place(self.metric, state, nominal))
+        before = error_energy(here, state - nominal)
         c = error_energy(matrix, error) - np.exp(-2.0 * self.rate * self.period) * before
         return (a[..., 0, 0], b[..., 0], c) if self.system.control_dim == 1 else (a, b, c)
 

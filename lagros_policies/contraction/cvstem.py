@@ -1,13 +1,9 @@
-"""CV-STEM: the contraction metric with the least steady-state tube, as one semidefinite program.
+"""CV-STEM: the contraction metric with the least steady-state tube, by semidefinite programs.
 
-Theorem 2, equations (14)-(16): over W_bar(theta) = sum_i W_i cos(theta)^i, nu and chi,
-
-    min chi + lambda nu
-    s.t. -dW_bar/dt + 2 sym(A W_bar) - 2 nu B B' <= -2 (alpha + margin) W_bar   at every sample
-         I <= W_bar <= chi I                                                    at every angle
-
-with one (nu, chi) for all samples, in scaled states z = S x. cvxpy states the same problem in the
-tests; here the matrices go to Clarabel directly, which spares the compilation.
+The program of `cvstem_program` imposes the condition at samples and the bounds of W_bar at places.
+A thousand samples make it slow, and almost all of them are slack; so it begins with few, and is
+solved again with those that were broken. The bounds are imposed on a grid of the cart-pole's
+angles, and for any other basis where a search of the region finds them broken.
 """
 
 from __future__ import annotations
@@ -18,131 +14,79 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
-from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 from lagros_envs.dynamics import System
-from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
-from lagros_policies.contraction.condition import Samples, condition_terms, contraction_residual
-from lagros_policies.contraction.metric import Metric, Region, basis, basis_rate
-from lagros_policies.contraction.semidefinite import (
-    ConeProgram,
-    cone_rows,
-    solve_cones,
-    svec,
-    symmetric_basis,
+from lagros_policies.contraction.basis import Basis
+from lagros_policies.contraction.condition import Samples, contraction_residual, search_violation
+from lagros_policies.contraction.cvstem_program import (
+    CvStemSettings,
+    InfeasibleError,
+    check_asked,
+    condition_rows,
+    solve_program,
 )
-from lagros_policies.contraction.systems import check_angle, check_sizes
+from lagros_policies.contraction.metric import Metric
+from lagros_policies.contraction.places import Point, extreme_places, is_on_grid, places_of
+from lagros_policies.contraction.regions import MetricRegion, joined
+
+__all__ = [
+    "CvStemSettings",
+    "InfeasibleError",
+    "design_metric",
+    "design_on_pool",
+    "design_on_region",
+    "search_rate",
+]
 
 FloatArray = NDArray[np.float64]
 
-# Angles at which I <= W_bar(theta) <= chi I is imposed.
+# Angles at which I <= W_bar <= chi I is imposed, and looked at afterwards; and states of a region
+# at which it is imposed first.
 _BOUND_ANGLES = 25
 _CHECK_ANGLES = 1001
-
-
-class InfeasibleError(ValueError):
-    """The condition has no solution for the asked rate and region."""
-
-
-@dataclass(frozen=True)
-class CvStemSettings:
-    """What to design.
-
-    Attributes:
-        contraction_rate: alpha [1/s].
-        degree: Degree of W_bar in cos(theta); 0 is a constant metric.
-        control_penalty: lambda, the weight of nu; zero is ill-posed.
-        margin: Added to alpha at the samples, so that the condition holds between them [1/s].
-        scaling: Diagonal of S, the units in which chi is measured, one per state.
-
-    Raises:
-        ValueError: A value is out of range.
-    """
-
-    contraction_rate: float = 0.3
-    degree: int = 4
-    control_penalty: float = 0.1
-    margin: float = 0.05
-    scaling: tuple[float, ...] = (1.0, 12.0, 1.0, 1.5)
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        check_fields(self)
-        check_positive("contraction_rate", self.contraction_rate)
-        check_whole("degree", self.degree, 0)
-        if not self.control_penalty > 0.0:
-            raise ValueError(
-                f"control_penalty={self.control_penalty!r} must be > 0: without it nu is unbounded"
-            )
-        check_not_negative("margin", self.margin)
-        for value in self.scaling:
-            check_positive("scaling", value)
+_BOUND_STATES = 40
+# By how much the bounds may be exceeded before they are imposed there too, and the least eigenvalue
+# with which W_bar is looked at further.
+_BOUND_SLACK = 0.01
+_LEAST = 0.1
+_BOUND_ROUNDS = 20
+# How near to binding a sample stays in the program of a region [1/s].
+_NEAR = 0.1
+# How many of the worst are added, wherever they are.
+_WORST = 8
+# How many more searches of a region must find nothing before a metric is taken.
+_SEEDS = 5
 
 
 def design_metric(
-    system: System, samples: Samples, region: Region, settings: CvStemSettings
+    system: System, samples: Samples, region: MetricRegion, settings: CvStemSettings
 ) -> Metric:
     """Solve the joint CV-STEM program over samples.
 
     Args:
         system: The system.
         samples: Where the condition is imposed.
-        region: The region that the samples cover, stored with the metric.
+        region: The region that the samples cover, over which the bounds hold; stored with the
+            metric.
         settings: What to design.
 
     Returns:
         The metric, not yet verified.
 
     Raises:
-        InfeasibleError: No metric exists for this alpha, region and degree.
+        InfeasibleError: No metric exists for this alpha, region and basis.
         RuntimeError: The solver stopped for another reason.
-        ValueError: Samples or scaling are not those of the system, or the degree is not 0 and state
-            1 of the system does not move at the rate of state 3.
+        ValueError: Samples, scaling or region are not those of the system, or a control moves a
+            basis of x.
     """
-    problem = _assemble(system, samples, region, settings)
-    values, status = solve_cones(problem)
-    if status in ("PrimalInfeasible", "AlmostPrimalInfeasible"):
-        raise InfeasibleError(
-            f"no contraction metric of degree {settings.degree} with "
-            f"alpha={settings.contraction_rate} (margin {settings.margin}) exists on {region}: "
-            "lower alpha or the margin, raise the degree, or shrink the region"
-        )
-    if values is None:
-        raise RuntimeError(
-            f"CV-STEM stopped with status {status} for alpha={settings.contraction_rate} on "
-            f"{region}; try another control_penalty or scaling"
-        )
-    scale = 1.0 / np.asarray(settings.scaling)
-    scaled = np.einsum(
-        "ij,jkl->ikl", values[:-2].reshape(settings.degree + 1, -1), problem.symmetric
-    )
-    # Between the angles at which the bounds were imposed they hold but for a little: chi is what a
-    # finer grid shows, with W_bar and nu scaled so that the least eigenvalue there is one.
-    angles = np.linspace(0.0, region.angle, _CHECK_ANGLES)
-    eigenvalues = np.linalg.eigvalsh(
-        np.einsum("ai,ijk->ajk", basis(angles, settings.degree), scaled)
-    )
-    least = float(eigenvalues.min())
-    if least <= 0.0:
-        raise RuntimeError(
-            f"CV-STEM gave a W_bar that is not positive between the angles of its grid (status "
-            f"{status}); try another degree or scaling"
-        )
-    return Metric(
-        coefficients=scaled * scale[:, None] * scale[None, :] / least,
-        contraction_rate=settings.contraction_rate,
-        condition_bound=float(eigenvalues.max()) / least,
-        control_weight=float(values[-2]) / least,
-        scaling=np.asarray(settings.scaling),
-        region=region,
-    )
+    every = np.arange(len(samples.state))
+    return _design(system, samples, every, region, settings, _Effort(0, _BOUND_ROUNDS))
 
 
 def design_on_pool(
     system: System,
     pool: Samples,
-    region: Region,
+    region: MetricRegion,
     settings: CvStemSettings,
     first: int = 60,
     rounds: int = 20,
@@ -162,32 +106,69 @@ def design_on_pool(
         rounds: Programs at most.
 
     Returns:
-        The metric; it satisfies the condition on the pool.
+        The metric; it satisfies the condition on the pool, and its bounds as far as a search of the
+        region finds.
 
     Raises:
-        InfeasibleError: No metric exists for this alpha, region and degree.
+        InfeasibleError: No metric exists for this alpha, region and basis.
         RuntimeError: The pool was not satisfied within the rounds.
     """
     active = np.arange(min(first, len(pool.state)))
-    worst = math.inf
-    for _ in range(rounds):
-        metric = design_metric(system, pool.take(active), region, settings)
-        residual = contraction_residual(system, metric, pool)
-        worst = float(residual.max())
-        if worst <= 0.0:
-            return metric
-        order = np.argsort(residual)[::-1]
-        active = np.union1d(active, order[: min(first, int(np.sum(residual > 0.0)))])
-    raise RuntimeError(
-        f"after {rounds} programs the condition still fails by {worst:.2e} 1/s on the pool: raise "
-        "the margin, which closes the gaps between samples"
-    )
+    return _design(system, pool, active, region, settings, _Effort(first, rounds))
+
+
+def design_on_region(
+    system: System,
+    region: MetricRegion,
+    settings: CvStemSettings,
+    pool: int = 20_000,
+    first: int = 60,
+    rounds: int = 40,
+    seed: int = 0,
+) -> Metric:
+    """Design a metric on triples drawn from its region, and where a search of it finds it broken.
+
+    Args:
+        system: The system.
+        region: Where the metric must contract; all of it, so that a `Region` of the cart-pole, of
+            which plans use a part, is rather designed on their pool.
+        settings: What to design.
+        pool: Triples to draw.
+        first: Triples to begin with, and about as many as are added at most each time.
+        rounds: Programs at most.
+        seed: Seed of the triples.
+
+    Returns:
+        The metric; condition and bounds hold as far as triples and search find (observed).
+
+    Raises:
+        InfeasibleError: No metric exists for this alpha, region and basis.
+        RuntimeError: Condition and bounds were not met within the rounds.
+    """
+    drawn = region.sample(np.random.default_rng(seed), pool)
+    active, effort = np.arange(min(first, pool)), _Effort(first, rounds, searched=True)
+    return _design(system, drawn, active, region, settings, effort)
+
+
+@dataclass(frozen=True)
+class _Effort:
+    """How a design looks for constraints that are broken.
+
+    Attributes:
+        first: Samples of the pool that are added at most each time; 0 if it is not looked at.
+        rounds: Programs at most.
+        searched: Whether the region is searched for samples that the pool does not have.
+    """
+
+    first: int
+    rounds: int
+    searched: bool = False
 
 
 def search_rate(
     system: System,
     samples: Samples,
-    region: Region,
+    region: MetricRegion,
     settings: CvStemSettings,
     rates: Sequence[float],
 ) -> tuple[Metric, list[tuple[float, float]]]:
@@ -228,47 +209,131 @@ def search_rate(
     return best, curve
 
 
-def _powers(state: FloatArray, degree: int) -> tuple[FloatArray, FloatArray]:
-    """Return the basis at states (s, n) and its rate, both (s, degree + 1)."""
-    if degree == 0:
-        return np.ones((len(state), 1)), np.zeros((len(state), 1))
-    angle, rate = state[:, ANGLE], state[:, ANGULAR_RATE]
-    return basis(angle, degree), basis_rate(angle, rate, degree)
+def _design(
+    system: System,
+    pool: Samples,
+    active: NDArray[np.intp],
+    region: MetricRegion,
+    settings: CvStemSettings,
+    effort: _Effort,
+) -> Metric:
+    """Solve the program, and again with the constraints that were broken, until none is.
+
+    Args:
+        system: The system.
+        pool: Where the condition must hold.
+        active: Samples of the pool to begin with.
+        region: Where the bounds must hold.
+        settings: What to design.
+        effort: How to look for what is broken.
+    """
+    check_asked(system, settings)
+    where = region, settings.phi, settings.point, system.state_dim
+    places = places_of(*where, _BOUND_ANGLES, _BOUND_STATES)
+    worst = math.inf
+    for turn in range(effort.rounds):
+        conditions = condition_rows(system, pool.take(active), settings)
+        scaled, weight, bound = solve_program(conditions, places, region, settings)
+        least, largest, outside = _bounds(scaled, bound, *where)
+        places = np.concatenate([places, outside])
+        if len(outside) and least <= _LEAST:
+            continue
+        metric = _scaled_metric(scaled, weight, (least, largest), region, settings)
+        pool, residual = _residual(system, metric, pool, effort, turn)
+        worst = float(residual.max())
+        if worst <= 0.0 and len(outside) == 0:
+            return metric
+        if effort.searched:
+            # What is far from binding decides nothing: the program stays small without it.
+            active = active[residual[active] > -2.0 * settings.margin - _NEAR]
+        active = np.union1d(active, _broken(residual, effort))
+    after = f"after {effort.rounds} programs"
+    if not 0.0 < worst < math.inf:
+        raise RuntimeError(
+            f"{after} the bounds of W_bar still fail on {region}: take a basis of fewer functions, "
+            "or a smaller region"
+        )
+    raise RuntimeError(
+        f"{after} the condition still fails by {worst:.2e} 1/s on the pool: raise the margin, "
+        "which closes the gaps between samples"
+    )
 
 
-def _assemble(
-    system: System, samples: Samples, region: Region, settings: CvStemSettings
-) -> ConeProgram:
-    scale = np.asarray(settings.scaling)
-    n = system.state_dim
-    check_sizes(system, scaling=(scale, (n,)))
-    slope, gain, motion = condition_terms(system, samples)
-    if settings.degree > 0:
-        check_angle(system, samples.state, motion, gain)
-    slope = slope * scale[:, None] / scale[None, :]
-    gain = gain * scale[:, None]
-    symmetric = symmetric_basis(n)
-    powers, power_rates = _powers(samples.state, settings.degree)
-    # d/dW_ij of the condition's left side, (s, degree + 1, basis, n, n).
-    product = np.einsum("sab,jbc->sjac", slope, symmetric)
-    both = product + np.swapaxes(product, -1, -2)
-    decay = 2.0 * (settings.contraction_rate + settings.margin)
-    by_dual = powers[:, :, None, None, None] * (both + decay * symmetric)[:, None]
-    by_dual -= power_rates[:, :, None, None, None] * symmetric
-    by_weight = -2.0 * gain @ np.swapaxes(gain, -1, -2)
-    blocks = [cone_rows(by_dual, by_weight, None)]
-    rights = [np.zeros(blocks[0].shape[0])]
-    # The bounds depend on the angle alone, which a grid covers; a constant metric needs one point.
-    grid = np.linspace(0.0, region.angle, _BOUND_ANGLES if settings.degree else 1)
-    bound_powers = basis(grid, settings.degree)
-    spread = bound_powers[:, :, None, None, None] * symmetric
-    unit = np.broadcast_to(np.eye(n), (len(bound_powers), n, n))
-    blocks.append(cone_rows(-spread, None, None))
-    rights.append(-svec(unit).ravel())
-    blocks.append(cone_rows(spread, None, -unit))
-    rights.append(np.zeros(blocks[-1].shape[0]))
-    cost = np.zeros(by_dual.shape[1] * by_dual.shape[2] + 2)
-    cost[-2:] = settings.control_penalty, 1.0
-    rows = sparse.csc_matrix(np.vstack(blocks))
-    cones = len(samples.state) + 2 * len(bound_powers)
-    return ConeProgram(cost, rows, np.concatenate(rights), cones, n, symmetric)
+def _bounds(
+    scaled: FloatArray, bound: float, region: MetricRegion, phi: Basis, point: Point, n: int
+) -> tuple[float, float, FloatArray]:
+    """Return the extreme eigenvalues of the scaled W_bar, and places to bound it at as well.
+
+    Raises:
+        RuntimeError: It is not positive between the angles of a grid, which no place is added to.
+    """
+
+    def dual(place: FloatArray) -> FloatArray:
+        return np.asarray(np.einsum("ai,ijk->ajk", phi.at(place), scaled), dtype=np.float64)
+
+    grid = is_on_grid(region, phi)
+    ends = places_of(region, phi, point, n, _CHECK_ANGLES, 1)
+    if not grid:
+        ends = np.concatenate(extreme_places(region, dual, point))
+    eigenvalues = np.linalg.eigvalsh(dual(ends))
+    least, largest = float(eigenvalues.min()), float(eigenvalues.max())
+    if grid and least <= 0.0:
+        raise RuntimeError(
+            "CV-STEM gave a W_bar that is not positive between the angles of its grid; try another "
+            "degree or scaling"
+        )
+    kept = least >= 1.0 - _BOUND_SLACK and largest <= bound * (1.0 + _BOUND_SLACK)
+    return least, largest, ends[:0] if grid or kept else ends
+
+
+def _residual(
+    system: System, metric: Metric, pool: Samples, effort: _Effort, turn: int
+) -> tuple[Samples, FloatArray]:
+    """Return the pool, with what searches of the region found, and by how much the metric fails."""
+    if not effort.first:
+        return pool, np.full(1, -math.inf)
+    if effort.searched:
+        pool = joined(pool, search_violation(system, metric, turn)[0])
+    residual = contraction_residual(system, metric, pool)
+    if effort.searched and residual.max() <= 0.0:
+        others = range(_SEEDS * turn + effort.rounds, _SEEDS * (turn + 1) + effort.rounds)
+        pool = joined(pool, *(search_violation(system, metric, seed)[0] for seed in others))
+        residual = contraction_residual(system, metric, pool)
+    return pool, residual
+
+
+def _broken(residual: FloatArray, effort: _Effort) -> NDArray[np.intp]:
+    """Return the samples to add: the worst, or the worst of each part of a pool in random order."""
+    order = np.argsort(residual)[::-1]
+    worst = order[: min(effort.first, int(np.sum(residual > 0.0)))]
+    if not effort.searched:
+        return worst
+    parts = np.array_split(np.arange(len(residual)), effort.first)
+    each = np.array([part[np.argmax(residual[part])] for part in parts if len(part)])
+    return np.union1d(each[residual[each] > 0.0], worst[:_WORST])
+
+
+def _scaled_metric(
+    scaled: FloatArray,
+    weight: float,
+    ends: tuple[float, float],
+    region: MetricRegion,
+    settings: CvStemSettings,
+) -> Metric:
+    """Return the metric in the units of the state.
+
+    Between the places at which the bounds were imposed they hold but for a little: chi is what a
+    finer look shows, with W_bar and nu scaled so that the least eigenvalue there is one.
+    """
+    least, largest = ends
+    scale = 1.0 / np.asarray(settings.scaling)
+    return Metric(
+        coefficients=scaled * scale[:, None] * scale[None, :] / least,
+        contraction_rate=settings.contraction_rate,
+        condition_bound=largest / least,
+        control_weight=weight / least,
+        scaling=np.asarray(settings.scaling),
+        region=region,
+        basis=settings.basis,
+        point=settings.point,
+    )

@@ -3,87 +3,34 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
-from typing import Protocol, Self
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_at_least, check_positive, check_whole
-from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
+from lagros_envs.checks import check_at_least, check_name, check_positive, check_whole
+from lagros_envs.dynamics.cartpole import ANGLE
+from lagros_policies.contraction.basis import CONSTANT, MOST_DEGREE, Basis, cosines
+from lagros_policies.contraction.places import (
+    Point,
+    at_angles,
+    extreme_places,
+    is_of_the_angle,
+    places_of,
+)
+from lagros_policies.contraction.regions import MetricRegion, Region
 
 FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
-_STATES = 4  # of a metric of the angle: [p, theta, dp/dt, dtheta/dt]
-# Far beyond any design, and far below where binomials overflow.
-_MOST_DEGREE = 40
-# Angles at which W_bar must be positive definite, and its least eigenvalue, of W_bar scaled to a
-# unit diagonal: far above rounding, far below any design.
+_STATES = 4  # of a metric of the cart-pole: [p, theta, dp/dt, dtheta/dt]
+# Angles, or states of the region, at which W_bar must be positive definite, and its least
+# eigenvalue, of W_bar scaled to a unit diagonal: far above rounding, far below any design.
 _ANGLES = 101
+_PLACES = 1000
 _LEAST = 1e-13
 # Rounding of W_ij against W_ji, as a share of the largest entry.
 _ASYMMETRY = 1e-9
-
-
-@dataclass(frozen=True)
-class Region:
-    """The states and errors for which a cart-pole metric was designed and checked.
-
-    The check draws triples (x, x_d, u_d) around plans and keeps those that lie within these bounds.
-    On a plan the force goes with the angle, so that this covers a part of the bounds only: taken as
-    a box of independent numbers they hold states at which the shipped metric fails. `prove` says
-    what holds on a whole box. Neither the metric nor its condition depends on the position, and
-    that of x_d's speed is bounded by the plans alone.
-
-    Attributes:
-        angle: Largest |theta| of x and of x_d [rad].
-        angular_rate: Largest |dtheta/dt| of x and of x_d [rad/s].
-        angle_error: Largest |theta - theta_d| [rad].
-        angular_rate_error: Largest error of the rate [rad/s].
-        force: Largest |u_d| [N].
-
-    Raises:
-        ValueError: A bound is not positive, or the angle reaches pi/2.
-    """
-
-    angle: float = 1.15
-    angular_rate: float = 4.0
-    angle_error: float = 0.35
-    angular_rate_error: float = 2.0
-    force: float = 40.0
-
-    def __post_init__(self) -> None:
-        """Check the bounds."""
-        for item in fields(self):
-            check_positive(item.name, getattr(self, item.name))
-        if self.angle >= math.pi / 2:
-            raise ValueError(
-                f"angle={self.angle!r} must be below pi/2, where the force loses its authority"
-            )
-
-    def contains(
-        self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
-    ) -> BoolArray:
-        """Return which triples (x, x_d, u_d) of a batch (..., 4), (..., 4), (..., 1) lie inside.
-
-        Raises:
-            ValueError: They are not of the cart-pole's four states and one control.
-        """
-        shapes = [np.shape(part)[-1:] for part in (state, nominal, nominal_control)]
-        if shapes != [(_STATES,), (_STATES,), (1,)]:
-            raise ValueError(
-                f"states and control end in {shapes}: a Region bounds the cart-pole's four states "
-                "[p, theta, dp/dt, dtheta/dt] and one force"
-            )
-        error = np.abs(state - nominal)
-        inside = np.abs(nominal_control[..., 0]) <= self.force
-        for point in (state, nominal):
-            inside &= np.abs(point[..., ANGLE]) <= self.angle
-            inside &= np.abs(point[..., ANGULAR_RATE]) <= self.angular_rate
-        inside &= error[..., ANGLE] <= self.angle_error
-        inside &= error[..., ANGULAR_RATE] <= self.angular_rate_error
-        return inside
 
 
 @dataclass(frozen=True)
@@ -119,7 +66,12 @@ class Verification:
 
 
 class DualMetric(Protocol):
-    """W_bar(x) and its rate: what the condition of Theorem 2 asks of a metric."""
+    """W_bar(x) and its rate: what the condition of Theorem 2 asks of a metric.
+
+    One with an attribute `point` of "nominal" is a function of x_d, and is given x_d and its
+    motion; all others are given x. `coordinates`, where there is one, says which entries of that
+    state the metric depends on.
+    """
 
     @property
     def contraction_rate(self) -> float:
@@ -132,12 +84,12 @@ class DualMetric(Protocol):
     def dual(self, state: FloatArray) -> FloatArray:
         """Return W_bar(x), shape (..., n, n), for states (..., n)."""
 
-    def dual_rate(self, state: FloatArray) -> FloatArray:
-        """Return dW_bar/dt along dtheta/dt of the state, shape (..., n, n)."""
+    def dual_rate(self, state: FloatArray, motion: FloatArray) -> FloatArray:
+        """Return dW_bar/dt where the state moves at dx/dt, both (..., n), shape (..., n, n)."""
 
 
 class ContractionMetric(DualMetric, Protocol):
-    """A metric of the angle that laws and tubes take: `Metric`, `NeuralMetric` or your own."""
+    """A metric that laws and tubes take: `Metric`, `NeuralMetric` or your own."""
 
     @property
     def condition_bound(self) -> float:
@@ -148,7 +100,7 @@ class ContractionMetric(DualMetric, Protocol):
         """Diagonal of S, the units in which chi is measured, shape (n,)."""
 
     @property
-    def region(self) -> Region:
+    def region(self) -> MetricRegion:
         """Where the metric was designed."""
 
     @property
@@ -158,8 +110,8 @@ class ContractionMetric(DualMetric, Protocol):
     def matrix(self, state: FloatArray) -> FloatArray:
         """Return M(x), shape (..., n, n), for states (..., n)."""
 
-    def matrix_rate(self, state: FloatArray) -> FloatArray:
-        """Return dM/dt along dtheta/dt of the state, shape (..., n, n)."""
+    def matrix_rate(self, state: FloatArray, motion: FloatArray) -> FloatArray:
+        """Return dM/dt where the state moves at dx/dt, both (..., n), shape (..., n, n)."""
 
     def verified(self, check: Verification) -> Self:
         """Return the metric with the outcome of a check."""
@@ -167,23 +119,26 @@ class ContractionMetric(DualMetric, Protocol):
 
 @dataclass(frozen=True)
 class Metric:
-    """W_bar(theta) = sum_i W_i cos(theta)^i, with M = nu W_bar^-1 (Theorem 2).
+    """W_bar = sum_i W_i phi_i, with M = nu W_bar^-1 (Theorem 2).
 
     Every use of M here is invariant to its scale, so M is given without the factor nu.
 
     Attributes:
-        coefficients: W_i, shape (degree + 1, n, n), symmetric.
+        coefficients: W_i, shape (k, n, n), symmetric.
         contraction_rate: alpha [1/s].
         condition_bound: chi, with I <= S W_bar S <= chi I for the scaling S.
         control_weight: nu, the weight of B B' in the condition.
         scaling: Diagonal of S, the units in which chi is measured, shape (n,).
         region: Where the metric was designed.
         verification: The independent check, or None.
+        basis: phi_i; None for 1, cos(theta), ... cos(theta)^(k-1) of the cart-pole's angle, and
+            for a constant metric of any states.
+        point: "state", where the phi_i are functions of x, or "nominal", where they are of x_d.
 
     Raises:
-        ValueError: The arrays do not fit each other or are not symmetric, W_bar depends on the
-            angle of other than four states or is not positive definite at the angles of the region,
-            or a number is out of range.
+        ValueError: The arrays do not fit each other or are not symmetric, W_bar has another basis
+            or region than its states or is not positive definite on the region, or a number is out
+            of range.
     """
 
     coefficients: FloatArray
@@ -191,8 +146,10 @@ class Metric:
     condition_bound: float
     control_weight: float
     scaling: FloatArray
-    region: Region
+    region: MetricRegion
     verification: Verification | None = None
+    basis: Basis | None = None
+    point: Point = "state"
 
     def __post_init__(self) -> None:
         """Check the arrays."""
@@ -201,15 +158,9 @@ class Metric:
         if not fits or 0 in shape:
             raise ValueError(
                 f"coefficients of shape {shape} and scaling of shape {self.scaling.shape} "
-                "must be (degree + 1, n, n) and (n,)"
+                "must be (k, n, n) and (n,)"
             )
-        if self.degree > 0 and shape[1] != _STATES:
-            raise ValueError(
-                f"coefficients of shape {shape}: a W_bar of the angle is of the four states "
-                "[p, theta, dp/dt, dtheta/dt]; one of other states is constant, with degree 0"
-            )
-        if self.degree > _MOST_DEGREE:
-            raise ValueError(f"coefficients: degree {self.degree} must be at most {_MOST_DEGREE}")
+        self._check_basis(shape)
         if not np.all(np.isfinite(self.coefficients)):
             raise ValueError("coefficients must be finite: there is an infinity or no number")
         for name in ("contraction_rate", "condition_bound", "control_weight"):
@@ -219,13 +170,36 @@ class Metric:
         check_at_least("condition_bound", self.condition_bound, 1)
         self._check_definite()
 
+    def _check_basis(self, shape: tuple[int, ...]) -> None:
+        count, size = shape[:2]
+        check_name("point", self.point, get_args(Point))
+        if self.basis is None:
+            if count > 1 and size != _STATES:
+                raise ValueError(
+                    f"coefficients of shape {shape}: without a basis W_bar is of the angle of the "
+                    "four states [p, theta, dp/dt, dtheta/dt]; name the basis of one of other "
+                    "states, or make it constant, with one coefficient"
+                )
+            if count > MOST_DEGREE + 1:
+                raise ValueError(f"coefficients: degree {count - 1} must be at most {MOST_DEGREE}")
+        elif self.basis.size != count:
+            raise ValueError(
+                f"coefficients of shape {shape} are {count}, and the basis has {self.basis.size} "
+                "functions"
+            )
+        elif self.basis.degree and max(self.basis.coordinates) >= size:
+            raise ValueError(
+                f"basis: x[{max(self.basis.coordinates)}] is none of the {size} states of "
+                f"coefficients of shape {shape}"
+            )
+
     def _check_definite(self) -> None:
         crossed = np.swapaxes(self.coefficients, 1, 2)
         largest = np.abs(self.coefficients).max(axis=(1, 2), keepdims=True)
         if np.any(np.abs(self.coefficients - crossed) > _ASYMMETRY * largest):
             raise ValueError("coefficients: every W_i must be symmetric; average it with W_i'")
-        angles = np.linspace(0.0, self.region.angle, _ANGLES) if self.degree else np.zeros(1)
-        dual = self.dual(at_angles(angles, len(self.scaling)))
+        places = places_of(self.region, self.phi, self.point, len(self.scaling), _ANGLES, _PLACES)
+        dual = self.dual(places)
         sizes = np.einsum("sii->si", dual)
         worst = int(np.argmin(sizes.min(axis=1)))
         least = float(sizes[worst].min())
@@ -235,51 +209,62 @@ class Metric:
             worst = int(np.argmin(values))
             least = float(values[worst])
         if not least > _LEAST:
-            where = f" at the angle {angles[worst]:.4g} rad of the region" if self.degree else ""
             raise ValueError(
-                f"coefficients: W_bar is not positive definite{where} (least eigenvalue about "
-                f"{least:.3g}), so that e'W_bar^-1 e measures no distance: check their signs"
+                f"coefficients: W_bar is not positive definite{self._where(places[worst])} (least "
+                f"eigenvalue about {least:.3g}), so that e'W_bar^-1 e measures no distance: check "
+                "their signs"
             )
+
+    def _where(self, place: FloatArray) -> str:
+        if self.phi == CONSTANT:
+            return ""
+        if is_of_the_angle(self.region, self.phi):
+            return f" at the angle {place[ANGLE]:.4g} rad of the region"
+        named = ", ".join(f"x[{index}]={place[index]:.4g}" for index in self.coordinates)
+        return f" at {named} of the region"
+
+    @property
+    def phi(self) -> Basis:
+        """The functions phi_i."""
+        return self.basis or cosines(ANGLE, len(self.coefficients) - 1)
 
     @property
     def degree(self) -> int:
-        """Degree of W_bar in cos(theta)."""
-        return len(self.coefficients) - 1
+        """Largest sum of the powers in one phi_i; zero of a constant metric."""
+        return self.phi.degree
 
     @property
-    def depends_on_angle(self) -> bool:
-        """Whether W_bar depends on state 1, whose rate is taken to be state 3."""
-        return self.degree > 0
+    def coordinates(self) -> tuple[int, ...]:
+        """Which entries of x, or of x_d, W_bar depends on."""
+        return self.phi.coordinates
 
     def dual(self, state: FloatArray) -> FloatArray:
-        """Return W_bar(x), shape (..., n, n), for states (..., n)."""
+        """Return W_bar at x, or x_d, of shape (..., n), shape (..., n, n)."""
         self._check_width(state)
         if self.degree == 0:
             return np.tile(self.coefficients[0], (*np.shape(state)[:-1], 1, 1))
-        powers = basis(state[..., ANGLE], self.degree)
-        value: FloatArray = np.einsum("...i,ijk->...jk", powers, self.coefficients)
+        value: FloatArray = np.einsum("...i,ijk->...jk", self.phi.at(state), self.coefficients)
         return value
 
-    def dual_rate(self, state: FloatArray) -> FloatArray:
-        """Return dW_bar/dt along dtheta/dt of the state, shape (..., n, n)."""
+    def dual_rate(self, state: FloatArray, motion: FloatArray) -> FloatArray:
+        """Return dW_bar/dt where the state moves at dx/dt, both (..., n), shape (..., n, n)."""
         self._check_width(state)
+        self._check_width(motion)
         if self.degree == 0:
             return np.zeros((*np.shape(state), len(self.scaling)))
         value: FloatArray = np.einsum(
-            "...i,ijk->...jk",
-            basis_rate(state[..., ANGLE], state[..., ANGULAR_RATE], self.degree),
-            self.coefficients,
+            "...i,ijk->...jk", self.phi.rate(state, motion), self.coefficients
         )
         return value
 
     def matrix(self, state: FloatArray) -> FloatArray:
-        """Return M(x) = W_bar(x)^-1, shape (..., n, n), for states (..., n)."""
+        """Return M = W_bar^-1 at x, or x_d, of shape (..., n), shape (..., n, n)."""
         return np.asarray(np.linalg.inv(self.dual(state)), dtype=np.float64)
 
-    def matrix_rate(self, state: FloatArray) -> FloatArray:
-        """Return dM/dt = -M (dW_bar/dt) M, shape (..., n, n)."""
+    def matrix_rate(self, state: FloatArray, motion: FloatArray) -> FloatArray:
+        """Return dM/dt = -M (dW_bar/dt) M where the state moves at dx/dt, shape (..., n, n)."""
         matrix = self.matrix(state)
-        return -matrix @ self.dual_rate(state) @ matrix
+        return -matrix @ self.dual_rate(state, motion) @ matrix
 
     def _check_width(self, state: FloatArray) -> None:
         if np.shape(state)[-1:] != self.scaling.shape:
@@ -293,32 +278,52 @@ class Metric:
         return replace(self, verification=check)
 
 
+def metric_place(metric: Any, state: FloatArray, nominal: FloatArray) -> FloatArray:
+    """Return what a metric is a function of: x_d where its `point` is "nominal", else x."""
+    return nominal if getattr(metric, "point", "state") == "nominal" else state
+
+
+def metric_is_still(metric: ContractionMetric) -> bool:
+    """Return whether M is known not to answer to x: it is constant, or a function of x_d."""
+    nominal: bool = getattr(metric, "point", "state") == "nominal"
+    return nominal or getattr(metric, "coordinates", None) == ()
+
+
+def drawn_places(metric: ContractionMetric) -> FloatArray:
+    """Return states that cover what a metric depends on in its region, shape (s, n)."""
+    size = len(metric.scaling)
+    if getattr(metric, "coordinates", None) == ():
+        return np.zeros((1, size))
+    drawn = metric.region.sample(np.random.default_rng(0), _PLACES)
+    return metric_place(metric, drawn.state, drawn.nominal)
+
+
 def extreme_eigenvalues(metric: ContractionMetric, points: int = 401) -> tuple[float, float]:
-    """Return the extreme eigenvalues of M over a grid of the region's angles (observed).
+    """Return the extreme eigenvalues of M over its region (observed).
+
+    On the cart-pole's `Region` by a grid of its angles, on every other by a search that begins with
+    random states.
 
     Args:
-        metric: A metric that is constant, or of the angle alone.
+        metric: The metric; on a `Region` one that is constant, or of the angle alone.
         points: Angles from 0 to the region's largest, each with both signs.
 
     Raises:
         ValueError: The metric depends on more than the angle, or is not positive definite.
     """
     check_at_least("points", points, 2)
-    angles = np.linspace(0.0, metric.region.angle, points)
-    values = np.linalg.eigvalsh(
-        np.concatenate([matrices_at(metric, angles), matrices_at(metric, -angles)])
-    )
+    region = metric.region
+    if isinstance(region, Region) and set(getattr(metric, "coordinates", ())) <= {ANGLE}:
+        angles = np.linspace(0.0, region.angle, points)
+        values = np.linalg.eigvalsh(
+            np.concatenate([matrices_at(metric, angles), matrices_at(metric, -angles)])
+        )
+    else:
+        ends = extreme_places(region, metric.dual, getattr(metric, "point", "state"))
+        values = np.concatenate([np.linalg.eigvalsh(metric.matrix(place)) for place in ends])
     if not values.min() > 0.0:
         raise ValueError(f"{metric!r} is not positive definite on its region: it is no metric")
     return float(values.min()), float(values.max())
-
-
-def at_angles(angles: FloatArray, size: int) -> FloatArray:
-    """Return states (..., size) at angles (...), zero but for the angle where there is one."""
-    states = np.zeros((*np.shape(angles), size))
-    if size > ANGLE:
-        states[..., ANGLE] = angles
-    return states
 
 
 def matrices_at(metric: ContractionMetric, angles: FloatArray) -> FloatArray:
@@ -341,15 +346,15 @@ def matrices_at(metric: ContractionMetric, angles: FloatArray) -> FloatArray:
     return matrix
 
 
-def basis(angle: FloatArray, degree: int) -> FloatArray:
-    """Return cos(theta)^i for i = 0 ... degree, shape (..., degree + 1)."""
-    powers: FloatArray = np.cos(angle)[..., None] ** np.arange(degree + 1)
-    return powers
+def region_angle(metric: ContractionMetric) -> float:
+    """Return the largest angle of a metric's region [rad].
 
-
-def basis_rate(angle: FloatArray, angular_rate: FloatArray, degree: int) -> FloatArray:
-    """Return the time derivative of the basis, shape (..., degree + 1)."""
-    exponents = np.arange(degree + 1)
-    lower = np.cos(angle)[..., None] ** np.maximum(exponents - 1, 0)
-    rates: FloatArray = -exponents * lower * (np.sin(angle) * angular_rate)[..., None]
-    return rates
+    Raises:
+        ValueError: The region is not the cart-pole's.
+    """
+    if not isinstance(metric.region, Region):
+        raise ValueError(
+            f"the metric's region, a {type(metric.region).__name__}, has no angle: this is for "
+            "metrics of the cart-pole, on a Region"
+        )
+    return metric.region.angle

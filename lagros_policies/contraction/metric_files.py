@@ -10,24 +10,39 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from lagros_envs.checks import check_positive
+import numpy as np
+
+from lagros_envs.checks import check_name, check_positive, shown
+from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_envs.files import write_atomic
 from lagros_envs.reading import MOST_TEXT, Record, named, parse_json, read_bytes
-from lagros_policies.contraction.metric import ContractionMetric, Metric, Region, Verification
+from lagros_policies.contraction.basis import Basis, cosines
+from lagros_policies.contraction.metric import ContractionMetric, Metric, Verification
+from lagros_policies.contraction.regions import BoxRegion, MetricRegion, PlanRegion, Region
 
+# The first of them is the cart-pole's: W_bar of its angle, on its region.
 _FORMAT = "lagros-metric-1"
 _BASIS = "cos(theta)^i"
+_GENERAL = "lagros-metric-2"
 _NETWORK = ".safetensors"
+# Regions of other systems, by the name in the file.
+_REGIONS: dict[str, type[BoxRegion | PlanRegion]] = {"box": BoxRegion, "plans": PlanRegion}
 
 
 def metric_record(metric: Metric) -> dict[str, Any]:
-    """Return a metric as the JSON object that `load_metric` reads; numbers keep every bit."""
-    return {
-        "format": _FORMAT,
-        "basis": _BASIS,
-        "coefficients": metric.coefficients.tolist(),
-        **design_record(metric),
-    }
+    """Return a metric as the JSON object that `load_metric` reads; numbers keep every bit.
+
+    Raises:
+        TypeError: Its region is of a class of the caller's own.
+    """
+    cosine = cosines(ANGLE, len(metric.coefficients) - 1)
+    plain = metric.point == "state" and metric.phi == cosine and isinstance(metric.region, Region)
+    kind = (
+        {"format": _FORMAT, "basis": _BASIS}
+        if plain
+        else {"format": _GENERAL, "basis": list(metric.phi.terms), "point": metric.point}
+    )
+    return {**kind, "coefficients": metric.coefficients.tolist(), **design_record(metric)}
 
 
 def design_record(metric: ContractionMetric) -> dict[str, Any]:
@@ -37,9 +52,27 @@ def design_record(metric: ContractionMetric) -> dict[str, Any]:
         "chi": metric.condition_bound,
         "nu": metric.control_weight,
         "scaling": metric.scaling.tolist(),
-        "region": asdict(metric.region),
+        "region": region_record(metric.region),
         "verification": None if metric.verification is None else _check_record(metric.verification),
     }
+
+
+def region_record(region: MetricRegion) -> dict[str, Any]:
+    """Return a region as what JSON can hold.
+
+    Raises:
+        TypeError: It is of a class of the caller's own.
+    """
+    if isinstance(region, Region):
+        return asdict(region)
+    for kind, wanted in _REGIONS.items():
+        if type(region) is wanted:
+            arrays = {item.name: getattr(region, item.name) for item in fields(wanted)}
+            return {
+                "kind": kind,
+                **{key: np.asarray(value).tolist() for key, value in arrays.items()},
+            }
+    raise TypeError(f"region={region!r} must be a Region, BoxRegion or PlanRegion to be written")
 
 
 def design_arguments(record: Record) -> dict[str, Any]:
@@ -51,8 +84,6 @@ def design_arguments(record: Record) -> dict[str, Any]:
     Raises:
         ValueError: An entry is missing, of a wrong type or out of range.
     """
-    region = record.record("region")
-    region.only([item.name for item in fields(Region)])
     numbers = {name: record.number(name) for name in ("alpha", "chi", "nu")}
     for name, value in numbers.items():
         check_positive(name, value)
@@ -61,11 +92,28 @@ def design_arguments(record: Record) -> dict[str, Any]:
         "condition_bound": numbers["chi"],
         "control_weight": numbers["nu"],
         "scaling": record.array("scaling", (None,)),
-        "region": Region(**{item.name: region.number(item.name) for item in fields(Region)}),
+        "region": _region(record.record("region")),
         "verification": None
         if record["verification"] is None
         else _verification(record.record("verification")),
     }
+
+
+def _region(record: Record) -> MetricRegion:
+    if "kind" not in record.entries:
+        record.only([item.name for item in fields(Region)])
+        return Region(**{item.name: record.number(item.name) for item in fields(Region)})
+    kind = record.text("kind")
+    check_name("kind", kind, _REGIONS)
+    names = [item.name for item in fields(_REGIONS[kind])]
+    record.only(["kind", *names])
+    arrays = {name: record.array(name) for name in names}
+    if kind == "plans":
+        return PlanRegion(**arrays)
+    for name, array in arrays.items():
+        if array.ndim != 1:
+            raise ValueError(f"{record.name}: {name!r} must be a list of numbers")
+    return BoxRegion(**{name: tuple(array.tolist()) for name, array in arrays.items()})
 
 
 def _check_record(check: Verification) -> dict[str, Any]:
@@ -114,14 +162,26 @@ def load_metric(path: Path | str | None = None, states: int | None = None) -> Me
             "load_neural_metric, and their condition is checked on samples"
         )
     record = Record(parse_json(data, named(path), "a metric written by save_metric"), named(path))
-    record.must("format", _FORMAT)
-    record.must("basis", _BASIS)
     with naming(path):
-        metric = Metric(record.array("coefficients"), **design_arguments(record))
+        metric = Metric(
+            record.array("coefficients"), **_functions(record), **design_arguments(record)
+        )
         size = len(metric.scaling)
         if states not in (None, size):
             raise ValueError(f"'coefficients' are of {size} states; the system has {states}")
     return metric
+
+
+def _functions(record: Record) -> dict[str, Any]:
+    """Return basis and point of a metric's file."""
+    if record.entries.get("format") != _GENERAL:
+        record.must("format", _FORMAT)
+        record.must("basis", _BASIS)
+        return {}
+    terms = record.list("basis")
+    if not all(isinstance(term, str) for term in terms):
+        raise ValueError(f"{record.name}: 'basis' is {shown(terms)} and must be a list of texts")
+    return {"basis": Basis(tuple(terms)), "point": record.text("point")}
 
 
 @contextmanager

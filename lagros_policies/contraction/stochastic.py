@@ -27,9 +27,16 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import check_at_least, check_not_negative, check_positive
 from lagros_envs.dynamics import System, hold_step
-from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
+from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_policies.contraction.double_integrator import AxisMetric
-from lagros_policies.contraction.metric import ContractionMetric, at_angles, matrices_at
+from lagros_policies.contraction.metric import (
+    ContractionMetric,
+    drawn_places,
+    matrices_at,
+    metric_is_still,
+    region_angle,
+)
+from lagros_policies.contraction.places import at_angles
 
 FloatArray = NDArray[np.float64]
 
@@ -91,13 +98,14 @@ def checked_intensity(intensity: Any, size: int) -> FloatArray:
 def mean_square_bound(
     metric: ContractionMetric, intensity: Any, initial_energy: float = 0.0
 ) -> MeanSquareBound:
-    """Return the bound for a metric of the angle, for a control at will.
+    """Return the bound for a metric that noise moves by the angle alone, for a control at will.
 
-    The suprema are taken over a grid of the region's angles (observed), and the bound holds while
-    the state stays in the region: noise leaves any region at some time, if rarely.
+    The suprema are taken over a grid of the region's angles, or over states drawn from it
+    (observed), and the bound holds while the state stays in the region: noise leaves any region at
+    some time, if rarely.
 
     Args:
-        metric: A metric that is constant, or of the angle alone.
+        metric: A metric that is constant, of x_d, or of the cart-pole's angle alone.
         intensity: g, shape (n,) [unit of the state / sqrt(s)].
         initial_energy: V(0).
 
@@ -111,13 +119,17 @@ def mean_square_bound(
     size = len(metric.scaling)
     squares = checked_intensity(intensity, size) ** 2
     check_not_negative("initial_energy", initial_energy)
-    angles = np.linspace(-metric.region.angle, metric.region.angle, _GRID)
-    matrix = matrices_at(metric, angles)
+    still = metric_is_still(metric)
+    if still:
+        matrix = metric.matrix(drawn_places(metric))
+    else:
+        angle = region_angle(metric)
+        angles = np.linspace(-angle, angle, _GRID)
+        matrix = matrices_at(metric, angles)
     power = float(np.max(np.einsum("sii,i->s", matrix, squares)))
     least = float(np.linalg.eigvalsh(matrix)[:, 0].min())
     angle_power = float(squares[ANGLE]) if size > ANGLE else 0.0
-    # A metric that says nothing of an angle may be anybody's, and depend on one.
-    if angle_power == 0.0 or not getattr(metric, "depends_on_angle", True):
+    if still or angle_power == 0.0:
         return MeanSquareBound(metric.contraction_rate, power, least, initial_energy)
     first, second = _variation(metric, angles, matrix)
     eps = _SHARES * metric.contraction_rate / angle_power
@@ -138,12 +150,14 @@ def _variation(
 ) -> tuple[float, float]:
     """Return mu_1 and mu_2 over the grid."""
     states = at_angles(angles, len(metric.scaling))
-    states[:, ANGULAR_RATE] = 1.0
-    slope = metric.matrix_rate(states)  # the states turn at 1 rad/s
+    turn = at_angles(np.ones(len(angles)), len(metric.scaling))  # at 1 rad/s
+    slope = metric.matrix_rate(states, turn)
     ahead, behind = states.copy(), states.copy()
     ahead[:, ANGLE] += _ANGLE_STEP
     behind[:, ANGLE] -= _ANGLE_STEP
-    curvature = (metric.matrix_rate(ahead) - metric.matrix_rate(behind)) / (2.0 * _ANGLE_STEP)
+    curvature = (metric.matrix_rate(ahead, turn) - metric.matrix_rate(behind, turn)) / (
+        2.0 * _ANGLE_STEP
+    )
     inverse = np.linalg.inv(matrix)
     column = slope[:, :, ANGLE]
     first = np.sqrt(np.einsum("si,sij,sj->s", column, inverse, column))

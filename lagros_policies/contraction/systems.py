@@ -1,25 +1,30 @@
 """Which systems the functions of this package are for: everything else is refused by name.
 
-Most take any control-affine `System`. Where a metric depends on an angle, its rate is taken from
-the state: that is right for a system whose state 1 moves at the rate of state 3, whatever the
-control (`check_angle`). What uses the equations of the cart-pole or of the spacecraft further than
-that (proofs, corners of boxes, thrusters) is for these two alone, not for a class derived from one,
-whose equation may be another.
+Most take any control-affine `System`, with a metric of x only if the control does not move it
+(`check_unmoved`); one of x_d serves the others. What uses the equations of the cart-pole or of the
+spacecraft (proofs, corners of boxes, thrusters) is for these two alone, not for a class derived
+from one, whose equation may be another.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.dynamics import CartPole, System
-from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
+from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_envs.dynamics.spacecraft import Spacecraft
-from lagros_policies.contraction.metric import Metric
+from lagros_policies.contraction.basis import Basis, cosines
+from lagros_policies.contraction.metric import DualMetric, Metric
+from lagros_policies.contraction.regions import Region
 
 FloatArray = NDArray[np.float64]
+
+# Rounding of what should be zero, as a share of the metric times the reach of the control.
+_ROUNDING = 1e-9
 
 
 def check_cartpole(system: Any, what: str) -> CartPole:
@@ -42,7 +47,7 @@ def check_cartpole_metric(metric: Any, what: str) -> None:
 
     Raises:
         TypeError: It is no `Metric`: of a network, say, nothing is proved.
-        ValueError: It is of other than four states.
+        ValueError: It is of other than four states, or not of cos(theta) on a `Region`.
     """
     if not isinstance(metric, Metric):
         raise TypeError(f"metric={metric!r} must be a Metric: {what} uses its coefficients")
@@ -50,6 +55,13 @@ def check_cartpole_metric(metric: Any, what: str) -> None:
         raise ValueError(
             f"the metric is of {len(metric.scaling)} states: {what} is for those of the cart-pole, "
             "[p, theta, dp/dt, dtheta/dt]"
+        )
+    angle = metric.point == "state" and metric.phi == cosines(ANGLE, len(metric.coefficients) - 1)
+    if not angle or not isinstance(metric.region, Region):
+        raise ValueError(
+            f"the metric is of {', '.join(metric.phi.terms)} at the {metric.point}, on a "
+            f"{type(metric.region).__name__}: {what} is for 1, cos(x[{ANGLE}]), ... at the state, "
+            "on a Region"
         )
 
 
@@ -81,28 +93,52 @@ def check_sizes(system: System, **arrays: tuple[FloatArray, tuple[int, ...]]) ->
             )
 
 
-def check_angle(system: System, state: FloatArray, motion: FloatArray, gain: FloatArray) -> None:
-    """Check, at given states, that state 1 of a system moves at the rate of state 3.
+def check_unmoved(system: System, metric: DualMetric, state: FloatArray, gain: FloatArray) -> None:
+    """Check, at given states, that no control moves a metric, whose rate would not be known.
 
     Args:
         system: The system.
+        metric: The metric; one of x_d passes, since the control of the plan is known.
         state: x, shape (..., n).
-        motion: dx/dt, shape (..., n).
         gain: B(x), shape (..., n, m).
 
     Raises:
-        ValueError: It moves otherwise, or is moved by the control.
+        ValueError: A control moves W_bar.
     """
-    if np.shape(state)[-1] > ANGULAR_RATE:
-        apart = np.abs(motion[..., ANGLE] - state[..., ANGULAR_RATE])
-        # What is not a number is no evidence of another motion.
-        if not (np.any(gain[..., ANGLE, :]) or np.any(apart > 0.0)):
-            return
-    raise ValueError(
-        f"a metric of cos(x[{ANGLE}]) is for systems with dx[{ANGLE}]/dt = x[{ANGULAR_RATE}], as "
-        f"the cart-pole's [p, theta, dp/dt, dtheta/dt]; {system!r} is none: use a constant metric "
-        "(degree 0) or a metric of your own, whose dual_rate knows the system"
-    )
+    places = getattr(metric, "coordinates", None)
+    known = places is not None and not np.any(gain[..., list(places), :])
+    if known or getattr(metric, "point", "state") == "nominal":
+        return
+    size = np.abs(metric.dual(state)).max(initial=0.0)
+    _check_still(system, lambda column: metric.dual_rate(state, column), size, state, gain)
+
+
+def check_basis_unmoved(system: System, phi: Basis, state: FloatArray, gain: FloatArray) -> None:
+    """Check, at given states (s, n), that no control moves the functions phi_i of a basis.
+
+    Raises:
+        ValueError: One does.
+    """
+    size = np.abs(phi.at(state)).max(initial=0.0)
+    _check_still(system, lambda column: phi.rate(state, column), size, state, gain)
+
+
+def _check_still(
+    system: System,
+    rate: Callable[[FloatArray], FloatArray],
+    size: float,
+    state: FloatArray,
+    gain: FloatArray,
+) -> None:
+    for control in range(gain.shape[-1]):
+        moved = np.abs(rate(gain[..., control])).reshape(*np.shape(state)[:-1], -1).max(axis=-1)
+        if np.any(moved > _ROUNDING * size * np.abs(gain).max(initial=0.0)):
+            worst = np.unravel_index(int(np.argmax(moved)), moved.shape)
+            raise ValueError(
+                f"control {control} of {system!r} moves a metric of the state at "
+                f"x={state[worst].tolist()}, so that dW_bar/dt depends on a control that is not "
+                'chosen yet: take a basis of other coordinates, or one of x_d (point="nominal")'
+            )
 
 
 def _check_class(name: str, value: Any, wanted: type, what: str) -> None:

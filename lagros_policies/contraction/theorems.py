@@ -38,7 +38,7 @@ from lagros_envs.dynamics import (
 from lagros_envs.numbers import Interval, exact, variable
 from lagros_policies.contraction.condition import Samples, condition_left
 from lagros_policies.contraction.control import contraction_terms
-from lagros_policies.contraction.metric import DualMetric, Metric
+from lagros_policies.contraction.metric import DualMetric, Metric, metric_place
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.proof.matrices import negative_definite
 from lagros_policies.contraction.proof.motion import accelerations, jacobian_parts, metric_series
@@ -178,7 +178,7 @@ def gain_residual(
         share: s.
     """
     left = condition_left(system, metric, samples, share)
-    dual = metric.dual(samples.state)
+    dual = metric.dual(metric_place(metric, samples.state, samples.nominal))
     worst = np.linalg.eigvalsh(left)[:, -1] / np.trace(dual, axis1=-2, axis2=-1)
     return np.asarray(worst, dtype=np.float64)
 
@@ -203,7 +203,8 @@ def feasibility_residual(system: System, metric: Metric, samples: Samples) -> Fl
         samples.nominal,
         samples.nominal_control,
     )
-    pull = np.einsum("...ij,...j->...i", metric.matrix(samples.state), error)
+    matrix = metric.matrix(metric_place(metric, samples.state, samples.nominal))
+    pull = np.einsum("...ij,...j->...i", matrix, error)
     gain = control_matrix(system, samples.state)
     deviation = -metric.control_weight * np.einsum("...ij,...i->...j", gain, pull)
     energy = np.sum(pull * error, axis=-1)

@@ -28,6 +28,7 @@ from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_policies.backends import LOKY, Backend
 from lagros_policies.contraction import Metric
+from lagros_policies.contraction.metric_files import region_record
 from lagros_policies.expert import CartPoleExpert, TrackedPlans
 from lagros_policies.imitation.shards import Shard, make_shards
 
@@ -274,7 +275,9 @@ def _record(
     law = {
         "coefficients": hashlib.sha256(metric.coefficients.tobytes()).hexdigest(),
         "alpha": metric.contraction_rate,
-        "region": asdict(metric.region),
+        "region": region_record(metric.region),
         "feedback": asdict(CartPoleExpert(metric, task_settings).feedback),
     }
+    if metric.basis is not None:
+        law |= {"basis": list(metric.basis.terms), "point": metric.point}
     return {"data": asdict(settings), "task": asdict(task_settings), "metric": law}

@@ -257,6 +257,8 @@ class _CartPoleExpert:
         return {name: counted[name] for name in ("plans", "failed_plans")}
 
     def record(self) -> dict[str, Any]:
+        from lagros_policies.contraction.metric_files import region_record
+
         expert, metric = self._policy.expert, self._metric
         check = metric.verification
         return {
@@ -266,7 +268,7 @@ class _CartPoleExpert:
                 "alpha": metric.contraction_rate,
                 "chi": metric.condition_bound,
                 "nu": metric.control_weight,
-                "region": asdict(metric.region),
+                "region": region_record(metric.region),
                 "verification": None if check is None else asdict(check),
             },
             "planner": asdict(expert.planner.settings),

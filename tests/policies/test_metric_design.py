@@ -125,7 +125,7 @@ def test_a_metric_that_is_not_positive_has_an_infinite_residual(system, metric, 
         contraction_rate=metric.contraction_rate,
         control_weight=metric.control_weight,
         dual=lambda state: sign * metric.dual(state),
-        dual_rate=lambda state: sign * metric.dual_rate(state),
+        dual_rate=lambda state, motion: sign * metric.dual_rate(state, motion),
     )
     residual = contraction_residual(system, broken, samples)
     assert 0 < one.sum() < len(one)

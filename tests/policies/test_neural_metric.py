@@ -68,7 +68,7 @@ def test_with_constant_weights_it_is_the_constant_metric():
     some = triples(50)
     args = some.state, some.nominal, some.nominal_control
     assert neural.matrix(some.state) == pytest.approx(constant.matrix(some.state))
-    assert np.all(neural.matrix_rate(some.state) == 0.0)
+    assert np.all(neural.matrix_rate(some.state, some.state) == 0.0)
     for metric_law in (robust_control,):
         ours, theirs = (metric_law(MODEL, m, 0.3, *args) for m in (neural, constant))
         assert ours == pytest.approx(theirs)
@@ -86,18 +86,16 @@ def test_its_rates_are_derivatives_and_it_is_positive_and_even(seed):
     metric = random_metric(seed)
     rng = np.random.default_rng(seed)
     state = rng.uniform(-1.1, 1.1, (40, 4)) * [1.0, 1.0, 1.0, 3.0]
-    step = 1e-6
-    moved = state[:, None].repeat(2, axis=1)
-    moved[:, 0, 1] += step * state[:, 3]
-    moved[:, 1, 1] -= step * state[:, 3]
+    step, motion = 1e-6, rng.standard_normal((40, 4))
+    moved = state[:, None] + step * motion[:, None] * np.array([[1.0], [-1.0]])
     for value, rate in ((metric.matrix, metric.matrix_rate), (metric.dual, metric.dual_rate)):
         both = value(moved)
         slope = (both[:, 0] - both[:, 1]) / (2.0 * step)
-        assert rate(state) == pytest.approx(slope, rel=1e-4, abs=1e-5 * np.abs(slope).max())
+        assert rate(state, motion) == pytest.approx(slope, rel=1e-4, abs=1e-5 * np.abs(slope).max())
     assert np.linalg.eigvalsh(metric.matrix(state)).min() > 0.0
     assert metric.matrix(-state) == pytest.approx(metric.matrix(state))
     # dM/dt is even too, as theta and dtheta/dt change sign together.
-    assert metric.matrix_rate(-state) == pytest.approx(metric.matrix_rate(state))
+    assert metric.matrix_rate(-state, -motion) == pytest.approx(metric.matrix_rate(state, motion))
     assert metric.matrix(state[3]) == pytest.approx(metric.matrix(state)[3])
 
 

@@ -84,7 +84,11 @@ def test_bad_metrics_are_refused_with_a_point_that_fails(system, shipped, oracle
     # The point again, by the oracle's own Jacobian.
     slope = oracle.jacobian(lambda x: oracle.rates(x, point.control), point.nominal)
     gain, dual = oracle.input_matrix(point.state), metric.dual(point.state)
-    left = slope @ dual + dual @ slope.T - metric.dual_rate(point.state)
+    left = (
+        slope @ dual
+        + dual @ slope.T
+        - metric.dual_rate(point.state, oracle.rates(point.state, point.control))
+    )
     left += 2 * metric.contraction_rate * dual - 2 * metric.control_weight * gain @ gain.T
     assert np.linalg.eigvalsh(left).max() > 0.0
 
@@ -164,7 +168,11 @@ def left_side(oracle, metric, state, other, control, alpha):
     slope = oracle.jacobian(lambda x: oracle.rates(x, control), other)
     gain, dual = oracle.input_matrix(state), metric.dual(state)
     product = slope @ dual
-    left = product + np.swapaxes(product, -1, -2) - metric.dual_rate(state)
+    left = (
+        product
+        + np.swapaxes(product, -1, -2)
+        - metric.dual_rate(state, oracle.rates(state, control))
+    )
     left -= 2.0 * metric.control_weight * gain @ np.swapaxes(gain, -1, -2)
     return left + 2.0 * alpha * dual
 

@@ -29,7 +29,7 @@ def test_it_is_exact_for_a_linear_system_whose_metric_is_tight():
         region=Region(),
         contraction_rate=alpha,
         matrix=lambda states: np.broadcast_to(np.eye(4), (*states.shape[:-1], 4, 4)),
-        matrix_rate=lambda states: np.zeros((*states.shape[:-1], 4, 4)),
+        matrix_rate=lambda states, motion: np.zeros((*states.shape[:-1], 4, 4)),
     )
     times = np.linspace(0.0, 5.0, 7)
     known = start * np.exp(-2 * alpha * times) + np.sum(g**2) / (2 * alpha) * (

@@ -56,8 +56,9 @@ def test_the_disturbed_rate_is_what_the_worst_error_needs(metric, oracle):
     """At the angle and the error that feel the disturbance most, 2 lost V is what it adds."""
     angle = np.linspace(0.0, 0.8, 801)
     states = np.zeros((801, 4))
-    states[:, 1], states[:, 3] = angle, 1.0
-    dual, slope = metric.dual(states), metric.dual_rate(states)
+    states[:, 1] = angle
+    turn = np.array([0.0, 1.0, 0.0, 0.0])
+    dual, slope = metric.dual(states), metric.dual_rate(states, turn)
     values = np.abs(np.linalg.eigvals(np.linalg.solve(dual, slope)).real).max(axis=1)
     place = int(np.argmax(values))
     pairs, vectors = np.linalg.eig(np.linalg.solve(dual[place], slope[place]))

@@ -12,6 +12,7 @@ from lagros_benchmarks.worst_case.cartpole import CartPoleTarget, Episodes, Flig
 from lagros_envs import cartpole_task as task
 from lagros_envs.dynamics import control_matrix
 from lagros_policies.contraction import certified_tube
+from lagros_policies.contraction.metric import region_angle
 from lagros_policies.expert import CartPoleExpert
 
 FloatArray = NDArray[np.float64]
@@ -138,6 +139,6 @@ class CertificateTarget(CartPoleTarget):
 def largest_gain(expert: CartPoleExpert, points: int = 1001) -> float:
     """Return b_bar, the largest ||B(x)|| over a grid of the region's angles (observed)."""
     states = np.zeros((points, task.STATE_DIM))
-    states[:, 1] = np.linspace(0.0, expert.metric.region.angle, points)
+    states[:, 1] = np.linspace(0.0, region_angle(expert.metric), points)
     matrices = control_matrix(expert.task.system, states)
     return float(np.linalg.norm(matrices, axis=(1, 2)).max())

@@ -24,8 +24,8 @@ from lagros_envs.dynamics import System
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.condition import Samples, condition_terms, contraction_residual
 from lagros_policies.contraction.cvstem import CvStemSettings, InfeasibleError
-from lagros_policies.contraction.metric import Region
 from lagros_policies.contraction.neural.metric import SIZE
+from lagros_policies.contraction.regions import Region
 from lagros_policies.contraction.systems import check_cartpole, check_sizes
 
 FloatArray = NDArray[np.float64]
@@ -52,9 +52,9 @@ class AngleSolution:
     scaling: FloatArray
 
     @property
-    def depends_on_angle(self) -> bool:
-        """Always: W_bar is of state 1, whose rate is taken to be state 3."""
-        return True
+    def coordinates(self) -> tuple[int, ...]:
+        """The angle: W_bar depends on nothing else."""
+        return (ANGLE,)
 
     def dual(self, state: FloatArray) -> FloatArray:
         """Return W_bar(x), shape (..., 4, 4), linear in cos(theta) between the angles."""
@@ -62,10 +62,10 @@ class AngleSolution:
         value: FloatArray = np.einsum("...j,jab->...ab", shares, self.duals)
         return value
 
-    def dual_rate(self, state: FloatArray) -> FloatArray:
-        """Return dW_bar/dt along dtheta/dt of the state, shape (..., 4, 4)."""
+    def dual_rate(self, state: FloatArray, motion: FloatArray) -> FloatArray:
+        """Return dW_bar/dt where the state moves at dx/dt, both (..., 4), shape (..., 4, 4)."""
         _, slopes = hats(state[..., ANGLE], self.angles)
-        change = slopes * state[..., ANGULAR_RATE, None]
+        change = slopes * motion[..., ANGLE, None]
         value: FloatArray = np.einsum("...j,jab->...ab", change, self.duals)
         return value
 

@@ -26,14 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_positive
-from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
+from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_envs.reading import Record, named, parse_json
-from lagros_policies.contraction.metric import (
-    Region,
-    Verification,
-    at_angles,
-)
+from lagros_policies.contraction.metric import Verification
 from lagros_policies.contraction.metric_files import design_arguments, design_record, naming
+from lagros_policies.contraction.places import at_angles
+from lagros_policies.contraction.regions import Region
 from lagros_policies.imitation.networks import Mlp
 
 FloatArray = NDArray[np.float64]
@@ -96,9 +94,9 @@ class NeuralMetric:
             )
 
     @property
-    def depends_on_angle(self) -> bool:
-        """Always: M is of state 1, whose rate is taken to be state 3."""
-        return True
+    def coordinates(self) -> tuple[int, ...]:
+        """The angle: M depends on nothing else."""
+        return (ANGLE,)
 
     def matrix(self, state: FloatArray) -> FloatArray:
         """Return M(x), shape (..., 4, 4), for states (..., 4)."""
@@ -106,12 +104,13 @@ class NeuralMetric:
         factor, _ = self._factor(state[..., ANGLE])
         return factor @ np.swapaxes(factor, -1, -2)
 
-    def matrix_rate(self, state: FloatArray) -> FloatArray:
-        """Return dM/dt along dtheta/dt of the state, shape (..., 4, 4)."""
+    def matrix_rate(self, state: FloatArray, motion: FloatArray) -> FloatArray:
+        """Return dM/dt where the state moves at dx/dt, both (..., 4), shape (..., 4, 4)."""
         self._check_width(state)
+        self._check_width(motion)
         factor, slope = self._factor(state[..., ANGLE])
         half = slope @ np.swapaxes(factor, -1, -2)
-        rate = state[..., ANGULAR_RATE, None, None]
+        rate = motion[..., ANGLE, None, None]
         value: FloatArray = rate * (half + np.swapaxes(half, -1, -2))
         return value
 
@@ -119,10 +118,10 @@ class NeuralMetric:
         """Return W_bar(x) = M^-1, shape (..., 4, 4)."""
         return np.asarray(np.linalg.inv(self.matrix(state)), dtype=np.float64)
 
-    def dual_rate(self, state: FloatArray) -> FloatArray:
+    def dual_rate(self, state: FloatArray, motion: FloatArray) -> FloatArray:
         """Return dW_bar/dt = -W_bar (dM/dt) W_bar, shape (..., 4, 4)."""
         dual = self.dual(state)
-        return -dual @ self.matrix_rate(state) @ dual
+        return -dual @ self.matrix_rate(state, motion) @ dual
 
     def verified(self, check: Verification) -> Self:
         """Return the metric with the outcome of a check."""
@@ -198,4 +197,7 @@ def load_neural_metric(path: Path | str | None = None) -> NeuralMetric:
     record = Record(parse_json(text, name, "that of a metric written by save_neural_metric"), name)
     record.must("kind", _FORMAT)
     with naming(path):
-        return NeuralMetric(network, **design_arguments(record))
+        arguments = design_arguments(record)
+        if not isinstance(arguments["region"], Region):
+            raise ValueError("'region' must be that of the cart-pole, without a kind")
+        return NeuralMetric(network, **arguments)

@@ -20,7 +20,6 @@ from lagros_envs.checks import (
 from lagros_envs.dynamics import System, control_matrix, state_dependent_coefficient
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.condition import Samples
-from lagros_policies.contraction.metric import Region
 from lagros_policies.contraction.neural.design import AngleSolution
 from lagros_policies.contraction.neural.metric import (
     OUTPUTS,
@@ -29,6 +28,7 @@ from lagros_policies.contraction.neural.metric import (
     feature,
     feature_slope,
 )
+from lagros_policies.contraction.regions import Region
 from lagros_policies.contraction.systems import check_cartpole
 from lagros_policies.imitation.networks import Mlp
 

@@ -19,11 +19,13 @@ from scipy import sparse
 from lagros_envs.checks import check_fields
 from lagros_envs.dynamics import CartPole, control_matrix, jacobian, linearise_hold
 from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
+from lagros_policies.contraction.basis import cosine_powers, cosine_rates
 from lagros_policies.contraction.cvstem import CvStemSettings, InfeasibleError
-from lagros_policies.contraction.metric import Metric, Region, basis, basis_rate
+from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.proof.cartpole import PROVED_BOX
 from lagros_policies.contraction.proof.condition import prove_bounds
+from lagros_policies.contraction.regions import Region
 from lagros_policies.contraction.semidefinite import (
     ConeProgram,
     cone_rows,
@@ -185,8 +187,8 @@ def _rate_blocks(
     scale, symmetric = np.asarray(settings.cvstem.scaling), symmetric_basis(4)
     slope = jacobian(system, pool.other, pool.control)[0] * scale[:, None] / scale
     gain = control_matrix(system, pool.state) * scale[:, None]
-    powers = basis(pool.state[:, ANGLE], settings.cvstem.degree)
-    moving = basis_rate(pool.state[:, ANGLE], pool.state[:, ANGULAR_RATE], settings.cvstem.degree)
+    powers = cosine_powers(pool.state[:, ANGLE], settings.cvstem.degree)
+    moving = cosine_rates(pool.state[:, ANGLE], pool.state[:, ANGULAR_RATE], settings.cvstem.degree)
     one_sided = np.einsum("sab,jbc->sjac", slope, symmetric)
     decay = 2.0 * (settings.cvstem.contraction_rate + margin)
     both = one_sided + np.swapaxes(one_sided, -1, -2) + decay * symmetric
@@ -202,8 +204,8 @@ def _held_blocks(
     scale, symmetric = np.asarray(settings.cvstem.scaling), symmetric_basis(4)
     following, slope, gain = linearise_hold(system, pool.state, pool.control, settings.period)
     slope, gain = slope * scale[:, None] / scale, gain * scale[:, None]
-    before = basis(pool.state[:, ANGLE], settings.cvstem.degree)
-    after = basis(following[:, ANGLE], settings.cvstem.degree)
+    before = cosine_powers(pool.state[:, ANGLE], settings.cvstem.degree)
+    after = cosine_powers(following[:, ANGLE], settings.cvstem.degree)
     decay = np.exp(-2.0 * (settings.cvstem.contraction_rate + margin) * settings.period)
     moved = np.einsum("sab,jbc,sdc->sjad", slope, symmetric, slope, optimize=True)
     by_dual = before[:, :, None, None, None] * moved[:, None]
@@ -232,7 +234,7 @@ def _solve(
     entries = (cvstem.degree + 1) * len(symmetric)
     columns = entries + 3
     angles = np.linspace(0.0, reach, _BOUND_ANGLES)
-    spread = (basis(angles, cvstem.degree) @ change.T)[:, :, None, None, None] * symmetric
+    spread = (cosine_powers(angles, cvstem.degree) @ change.T)[:, :, None, None, None] * symmetric
     unit = np.broadcast_to(np.eye(4), (_BOUND_ANGLES, 4, 4))
     by_rate, by_nu = _rate_blocks(system, pool, settings, cvstem.margin)
     by_hold, by_held_nu = _held_blocks(system, held, settings, cvstem.margin)

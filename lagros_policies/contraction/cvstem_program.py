@@ -1,0 +1,169 @@
+"""The semidefinite program of CV-STEM: what is asked, its cones, and its solution.
+
+Theorem 2, equations (14)-(16): over W_bar = sum_i W_i phi_i of x or of x_d, nu and chi,
+
+    min chi + lambda nu
+    s.t. -dW_bar/dt + 2 sym(A W_bar) - 2 nu B B' <= -2 (alpha + margin) W_bar   at every sample
+         I <= W_bar <= chi I                                                    at every place
+
+with one (nu, chi) for all samples, in scaled states z = S x. cvxpy states the same problem in the
+tests; here the matrices go to Clarabel directly, which spares the compilation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
+from lagros_envs.dynamics import System, vector_field
+from lagros_envs.dynamics.cartpole import ANGLE
+from lagros_policies.contraction.basis import CONSTANT, Basis, cosines
+from lagros_policies.contraction.condition import condition_terms
+from lagros_policies.contraction.places import Point
+from lagros_policies.contraction.regions import MetricRegion, Samples
+from lagros_policies.contraction.semidefinite import (
+    ConeProgram,
+    cone_rows,
+    solve_cones,
+    svec,
+    symmetric_basis,
+)
+from lagros_policies.contraction.systems import check_basis_unmoved, check_sizes
+
+FloatArray = NDArray[np.float64]
+
+_STATES = 4  # of the cart-pole
+
+
+class InfeasibleError(ValueError):
+    """The condition has no solution for the asked rate and region."""
+
+
+@dataclass(frozen=True)
+class CvStemSettings:
+    """What to design.
+
+    Attributes:
+        contraction_rate: alpha [1/s].
+        degree: Degree of W_bar in cos(theta); 0 is a constant metric. A basis takes its place.
+        control_penalty: lambda, the weight of nu; zero is ill-posed.
+        margin: Added to alpha at the samples, so that the condition holds between them [1/s].
+        scaling: Diagonal of S, the units in which chi is measured, one per state.
+        basis: phi_i of W_bar; None for 1, cos(theta), ... of the cart-pole's angle.
+        point: Whether they are functions of x ("state") or of x_d ("nominal").
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    contraction_rate: float = 0.3
+    degree: int = 4
+    control_penalty: float = 0.1
+    margin: float = 0.05
+    scaling: tuple[float, ...] = (1.0, 12.0, 1.0, 1.5)
+    basis: Basis | None = None
+    point: Point = "state"
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_fields(self)
+        check_positive("contraction_rate", self.contraction_rate)
+        check_whole("degree", self.degree, 0)
+        if not self.control_penalty > 0.0:
+            raise ValueError(
+                f"control_penalty={self.control_penalty!r} must be > 0: without it nu is unbounded"
+            )
+        check_not_negative("margin", self.margin)
+        for value in self.scaling:
+            check_positive("scaling", value)
+
+    @property
+    def phi(self) -> Basis:
+        """The functions phi_i."""
+        return self.basis or cosines(ANGLE, self.degree)
+
+
+def check_asked(system: System, settings: CvStemSettings) -> None:
+    """Check that scaling and basis are of the states of a system.
+
+    Raises:
+        ValueError: They are not.
+    """
+    n, phi = system.state_dim, settings.phi
+    check_sizes(system, scaling=(np.asarray(settings.scaling), (n,)))
+    if settings.basis is None and settings.degree > 0 and n != _STATES:
+        raise ValueError(
+            f"degree={settings.degree!r} is that of the cart-pole's cos(theta), and {system!r} has "
+            f"{n} states: name a basis, or take degree=0"
+        )
+    if phi != CONSTANT and max(phi.coordinates) >= n:
+        raise ValueError(
+            f"basis: x[{max(phi.coordinates)}] is none of the {n} states of {system!r}"
+        )
+
+
+def solve_program(
+    conditions: FloatArray, places: FloatArray, region: MetricRegion, settings: CvStemSettings
+) -> tuple[FloatArray, float, float]:
+    """Return W_i of the scaled states (k, n, n), nu and chi, with the bounds at places."""
+    symmetric = symmetric_basis(places.shape[1])
+    spread = settings.phi.at(places)[:, :, None, None, None] * symmetric
+    unit = np.broadcast_to(np.eye(places.shape[1]), (len(places), *symmetric.shape[1:]))
+    below, above = cone_rows(-spread, None, None), cone_rows(spread, None, -unit)
+    rights = np.zeros(len(conditions)), -svec(unit).ravel(), np.zeros(len(above))
+    cost = np.zeros(conditions.shape[1])
+    cost[-2:] = settings.control_penalty, 1.0
+    cones = len(conditions) // len(symmetric) + 2 * len(places)
+    values, status = solve_cones(
+        ConeProgram(
+            cost,
+            sparse.csc_matrix(np.vstack([conditions, below, above])),
+            np.concatenate(rights),
+            cones,
+            places.shape[1],
+            symmetric,
+        )
+    )
+    asked = f"alpha={settings.contraction_rate} (margin {settings.margin})"
+    if status in ("PrimalInfeasible", "AlmostPrimalInfeasible"):
+        kind = f"of degree {settings.degree}" if settings.basis is None else "of this basis"
+        raise InfeasibleError(
+            f"no contraction metric {kind} with {asked} exists on {region}: lower alpha or the "
+            "margin, raise the degree, or shrink the region"
+        )
+    if values is None:
+        raise RuntimeError(
+            f"CV-STEM stopped with status {status} for {asked} on {region}; try another "
+            "control_penalty or scaling"
+        )
+    scaled = np.einsum("ij,jkl->ikl", values[:-2].reshape(settings.phi.size, -1), symmetric)
+    return scaled, float(values[-2]), float(values[-1])
+
+
+def condition_rows(system: System, samples: Samples, settings: CvStemSettings) -> FloatArray:
+    """Return the rows of the condition at every sample, one cone each."""
+    scale = np.asarray(settings.scaling)
+    n, phi = system.state_dim, settings.phi
+    slope, gain, motion = condition_terms(system, samples)
+    place = samples.state
+    if settings.point == "nominal":
+        place = samples.nominal
+        motion = vector_field(system, place, samples.nominal_control)
+    else:
+        check_basis_unmoved(system, phi, place, gain)
+    slope = slope * scale[:, None] / scale[None, :]
+    gain = gain * scale[:, None]
+    symmetric = symmetric_basis(n)
+    values, rates = phi.at(place), phi.rate(place, motion)
+    # d/dW_ij of the condition's left side, (s, k, n(n+1)/2, n, n).
+    product = np.einsum("sab,jbc->sjac", slope, symmetric)
+    both = product + np.swapaxes(product, -1, -2)
+    decay = 2.0 * (settings.contraction_rate + settings.margin)
+    by_dual = values[:, :, None, None, None] * (both + decay * symmetric)[:, None]
+    by_dual -= rates[:, :, None, None, None] * symmetric
+    by_weight = -2.0 * gain @ np.swapaxes(gain, -1, -2)
+    return cone_rows(by_dual, by_weight, None)

@@ -1,0 +1,90 @@
+"""The states that stand for what a metric depends on: a grid of angles, or drawn from a region."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.dynamics.cartpole import ANGLE
+from lagros_policies.contraction.basis import CONSTANT, Basis
+from lagros_policies.contraction.regions import MetricRegion, Region, Samples, search_region
+
+FloatArray = NDArray[np.float64]
+# Whether W_bar is a function of x or of x_d.
+Point = Literal["state", "nominal"]
+
+
+def places_of(
+    region: MetricRegion, basis: Basis, point: Point, size: int, angles: int, count: int
+) -> FloatArray:
+    """Return states that cover what W_bar depends on in a region, shape (s, size).
+
+    Args:
+        region: The region.
+        basis: phi_i of W_bar.
+        point: What they are functions of.
+        size: Number n of states.
+        angles: States for a metric of the cart-pole's angle, even in it: angles from 0 on.
+        count: States for any other that is not constant, drawn from the region.
+
+    Raises:
+        ValueError: The region is of other states.
+    """
+    if basis == CONSTANT:
+        return np.zeros((1, size))
+    angle = is_of_the_angle(region, basis)
+    drawn = region.sample(np.random.default_rng(0), 1 if angle else count)
+    if drawn.state.shape[1] != size:
+        raise ValueError(
+            f"region: it is of {drawn.state.shape[1]} states, and the metric is of {size}: give a "
+            "BoxRegion or PlanRegion of these"
+        )
+    if is_of_the_angle(region, basis):
+        return at_angles(np.linspace(0.0, region.angle, angles), size)
+    return drawn.nominal if point == "nominal" else drawn.state
+
+
+def extreme_places(
+    region: MetricRegion, dual: Callable[[FloatArray], FloatArray], point: Point
+) -> list[FloatArray]:
+    """Return where W_bar has its least and its largest eigenvalues on a region (observed).
+
+    Args:
+        region: The region.
+        dual: From states (s, n) to W_bar (s, n, n).
+        point: What W_bar is a function of.
+
+    Returns:
+        States (s, n) that the search for each of the two ended at, the most extreme first.
+    """
+
+    def spectrum(drawn: Samples) -> FloatArray:
+        place = drawn.nominal if point == "nominal" else drawn.state
+        return np.asarray(np.linalg.eigvalsh(dual(place)), dtype=np.float64)
+
+    found = []
+    for score in (lambda drawn: -spectrum(drawn)[:, 0], lambda drawn: spectrum(drawn)[:, -1]):
+        ended, _ = search_region(region, score, np.random.default_rng(0))
+        found.append(ended.nominal if point == "nominal" else ended.state)
+    return found
+
+
+def at_angles(angles: FloatArray, size: int) -> FloatArray:
+    """Return states (..., size) at angles (...), zero but for the angle where there is one."""
+    states = np.zeros((*np.shape(angles), size))
+    if size > ANGLE:
+        states[..., ANGLE] = angles
+    return states
+
+
+def is_on_grid(region: MetricRegion, basis: Basis) -> bool:
+    """Return whether `places_of` covers a region without drawing from it."""
+    return basis == CONSTANT or is_of_the_angle(region, basis)
+
+
+def is_of_the_angle(region: MetricRegion, basis: Basis) -> TypeGuard[Region]:
+    """Return whether W_bar is a polynomial of cos(theta) on the cart-pole's region."""
+    return isinstance(region, Region) and basis.cosine == ANGLE
