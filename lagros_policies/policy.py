@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from collections.abc import Callable
 from typing import Any, Literal, Protocol, TypeVar, cast, runtime_checkable
@@ -10,7 +9,8 @@ from typing import Any, Literal, Protocol, TypeVar, cast, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_flag
+from lagros_envs.checks import check_flag, shown, suggestion
+from lagros_envs.scenarios import preset_named
 from lagros_envs.spacecraft_task import SpacecraftSettings
 from lagros_policies.naming import UserClass, model_file, user_class
 from lagros_policies.wrappers import bare_environment
@@ -141,7 +141,8 @@ def make(
         The policy.
 
     Raises:
-        ValueError: The name or the id is unknown, or a wrapper may change what an observation or
+        ValueError: The name or the id is unknown, the settings or the preset are others than those
+            of the environment, or a wrapper may change what an observation or
             an action means, or the weights are another policy's or were made for other settings.
         TypeError: The environment is not one of this package.
         ImportError: A package that the policy needs is not installed.
@@ -149,13 +150,15 @@ def make(
     check_flag("allow_wrappers", allow_wrappers)
     check_flag("allow_other_settings", allow_other_settings)
     world = bare_environment(env, allow_wrappers)
+    if not isinstance(name, str):
+        raise ValueError(f"name={shown(name)} must be text: a name, a path or module:Class")
     if "settings" in settings:
-        raise ValueError(
-            "settings are those of the environment: make the environment with them, or build the "
-            "class of the policy yourself"
-        )
+        raise _of_the_environment("settings")
     if isinstance(world.settings, SpacecraftSettings):
         classes = _SPACECRAFT
+        preset = preset_named(settings.get("preset", world.preset))
+        if preset.for_agents(settings.get("num_agents")) != world.preset:
+            raise _of_the_environment("preset" if "preset" in settings else "num_agents")
         settings = {"preset": world.preset, **settings}
     else:
         classes = _CARTPOLE
@@ -169,11 +172,16 @@ def make(
     own = user_class(name)
     if own is not None:
         return _built(_class_named(name, own), world, allow_other_settings, settings)
-    near = difflib.get_close_matches(name, classes, n=1)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
     raise ValueError(
-        f"policy {name!r} is not known.{hint} Use one of {', '.join(classes)}, the path of a "
-        "stable-baselines3 zip, or module:Class"
+        f"policy {shown(name)} is not known.{suggestion(name, classes)} Use one of "
+        f"{', '.join(classes)}, the path of a stable-baselines3 zip, or module:Class"
+    )
+
+
+def _of_the_environment(what: str) -> ValueError:
+    return ValueError(
+        f"{what}: a policy takes those of the environment; make the environment with them, or "
+        "build the class of the policy yourself"
     )
 
 

@@ -68,6 +68,8 @@ HARMLESS: dict[str, frozenset[str]] = {
 }
 # What a subclass may override and still change neither observations nor actions.
 _APART = frozenset({"class_name", "close", "metadata", "render", "render_mode", "reward", "spec"})
+# With these a class answers in place of all that it has.
+_HOOKS = ("__getattribute__",)
 # What the wrappers of Gymnasium that map observations or actions define.
 _MAPPINGS = ("observation", "observations", "action", "actions")
 # Where wrappers keep what they wrap.
@@ -154,8 +156,8 @@ def _one_of(vector: str, envs: Iterable[Any], allow_wrappers: bool) -> Any:
     worlds = [bare_environment(env, allow_wrappers) for env in envs]
     first = worlds[0]
     for index, world in enumerate(worlds):
-        for name in ("settings", "preset"):
-            if getattr(world, name, None) != getattr(first, name, None):
+        for name in ("settings", "preset", "disturbance_bound"):
+            if _told(world, name) != _told(first, name):
                 raise ValueError(
                     f"the environments 0 and {index} of {vector} differ in their {name}; a policy "
                     "is for one: give it one of the environments"
@@ -163,10 +165,15 @@ def _one_of(vector: str, envs: Iterable[Any], allow_wrappers: bool) -> Any:
     return first
 
 
+def _told(world: Any, name: str) -> Any:
+    """Return what a policy is told of an environment."""
+    return world.disturbance.bound if name == "disturbance_bound" else getattr(world, name, None)
+
+
 def _check(env: Any, inner: Any) -> None:
     """Refuse a wrapper, or a subclass of an environment, that may change what is seen or done."""
     kind = type(env)
-    change = what_it_changes(kind)
+    change = what_it_changes(kind) or _replaced(env)
     if change is None and inner is not None:
         spaces = (name for name in _SPACES if _space(env, name) != _space(inner, name))
         change = next((f"has another {name}" for name in spaces), None)
@@ -193,9 +200,16 @@ def what_it_changes(kind: type) -> str | None:
         if package == "lagros_envs" or base.__name__ in HARMLESS.get(package, ()):
             names = (name for name in overridden if name in _MAPPINGS or hasattr(base, name))
             return next((f"overrides {name}" for name in names), None)
-        own = (name for name in vars(base) if not name.startswith("__"))
+        own = (name for name in vars(base) if name in _HOOKS or not name.startswith("__"))
         overridden += [name for name in own if name not in _APART]
     return "is not known"
+
+
+def _replaced(env: Any) -> str | None:
+    """Say which method of its class an object has another function for; None for none."""
+    own = (name for name, value in vars(env).items() if callable(value) and name not in _APART)
+    found = (name for name in own if callable(getattr(type(env), name, None)))
+    return next((f"has {name} replaced" for name in found), None)
 
 
 def _space(env: Any, name: str) -> Any:

@@ -2,6 +2,7 @@
 
 import inspect
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -62,8 +63,24 @@ def test_only_true_permits(permission, value):
 
 
 def test_settings_come_with_the_environment():
-    with pytest.raises(ValueError, match="settings are those of the environment"):
+    with pytest.raises(ValueError, match="settings: a policy takes those of the environment"):
         make("lqr", world("cartpole"), settings={"force_limit": 5.0})
+
+
+@pytest.mark.parametrize("name", ["lagros", "tube-mpc", "centralized"])
+def test_the_preset_comes_with_the_environment(name):
+    env = world("spacecraft")
+    for other in ({"preset": "released"}, {"preset": {"agents": 3}}, {"num_agents": 3}):
+        with pytest.raises(ValueError, match=f"{next(iter(other))}: a policy takes those of the"):
+            make(name, env, **other)
+    for same in ({"preset": env.preset}, {"preset": "open", "num_agents": 2}, {"num_agents": 2}):
+        assert make(name, env, **same).preset == env.preset
+
+
+@pytest.mark.parametrize("name", [None, 3, ["lqr"], Path("lqr"), b"lqr"])
+def test_the_name_of_a_policy_is_text(name):
+    with pytest.raises(ValueError, match=r"name=.* must be text"):
+        make(name, world("cartpole"))
 
 
 def test_a_class_takes_the_settings_that_an_environment_takes():

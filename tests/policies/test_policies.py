@@ -85,7 +85,7 @@ def test_a_thing_without_the_members_is_no_policy():
 
 
 @pytest.mark.parametrize(
-    ("name", "hint"), [("lagross", "lagros"), ("tube_mpc", "tube-mpc"), ("LEARNED", None)]
+    ("name", "hint"), [("lagross", "lagros"), ("tube_mpc", "tube-mpc"), ("LEARNED", "learned")]
 )
 def test_unknown_name_is_refused_with_a_hint_and_the_names(env, name, hint):
     with pytest.raises(ValueError, match=name) as caught:

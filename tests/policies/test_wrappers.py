@@ -304,6 +304,10 @@ def test_environments_of_a_vector_must_be_alike():
     vectors = gym.vector.SyncVectorEnv([lambda: cartpole(settings=next(settings))] * 2)
     with pytest.raises(ValueError, match="0 and 1 of SyncVectorEnv differ in their settings"):
         make("lqr", vectors)
+    bounds = iter([0.1, 0.9])
+    vectors = gym.vector.SyncVectorEnv([lambda: cartpole(disturbance_bound=next(bounds))] * 2)
+    with pytest.raises(ValueError, match="0 and 1 of SyncVectorEnv differ in their disturbance_b"):
+        make("lqr", vectors)
 
 
 class Counting(gym.Wrapper[Any, Any, Any, Any]):
@@ -380,6 +384,27 @@ def test_judges_a_users_subclass_of_the_environment():
     assert make("lqr", Named()).name == "lqr"
     with pytest.raises(ValueError, match=r"^Twice overrides _observation"):
         make("lqr", Twice())
+
+
+class Answering(gym.Wrapper[Any, Any, Any, Any]):
+    """A wrapper that answers in place of its methods."""
+
+    def __getattribute__(self, name: str) -> Any:
+        return object.__getattribute__(self, name)
+
+
+@pytest.mark.parametrize("depth", ["wrapper", "environment"])
+@pytest.mark.parametrize("name", ["step", "reset"])
+def test_refuses_what_has_a_method_replaced(depth, name):
+    env = cartpole()
+    changed = env if depth == "wrapper" else env.unwrapped
+    original = getattr(changed, name)
+    setattr(changed, name, lambda *given, **named: original(*given, **named))
+    with pytest.raises(ValueError, match=f"^{type(changed).__name__} has {name} replaced"):
+        make("lqr", env)
+    assert make("lqr", env, allow_wrappers=True).name == "lqr"
+    with pytest.raises(ValueError, match=r"^Answering overrides __getattribute__"):
+        make("lqr", Answering(cartpole()))
 
 
 def test_an_id_or_a_spec_makes_the_environment():
