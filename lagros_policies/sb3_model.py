@@ -117,8 +117,8 @@ def load_stable_baselines3(
         ValueError: The file is no such model, would expand to more than `MOST_EXPANDED`, its
             algorithm is unknown or cannot be detected, or its spaces are not those of the task.
     """
-    path = Path(path)
     check_archive(path)
+    path = Path(path)
     chosen = detect_algorithm(path) if algorithm is None else algorithm.upper()
     if chosen not in ALGORITHMS:
         raise ValueError(f"algorithm {algorithm!r} is not known; use one of {_known()}")
@@ -182,7 +182,7 @@ def detect_algorithm(path: Path | str) -> str:
     raise _unclear(path)
 
 
-def check_archive(path: Path) -> None:
+def check_archive(path: Path | str) -> None:
     """Check, before anything in it is expanded, that a zip is no larger than a model.
 
     Args:

@@ -7,9 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lagros_envs.scenarios import Scenario
 from lagros_policies import make
+from lagros_policies.actor import Actor
+from lagros_policies.contraction import load_metric
+from lagros_policies.contraction.neural.metric import load_neural_metric
+from lagros_policies.imitation.deep_set import DeepSet
+from lagros_policies.imitation.networks import Mlp
 from lagros_policies.policy import _CARTPOLE, _SPACECRAFT
 from lagros_policies.safety import SafetyFilter
+from lagros_policies.sb3_model import load_stable_baselines3
 from tests.policies.test_objects import CARTPOLE, OPTIONS, SPACECRAFT, world
 
 HUGE = 10**400
@@ -113,3 +120,21 @@ def test_the_filter_is_for_a_policy_and_a_task():
             SafetyFilter(policy, disturbance_bound=bound)
     with pytest.raises(ValueError, match="barrier="):
         SafetyFilter(policy, barrier=3)
+
+
+READERS = [
+    Scenario.load,
+    Mlp.load,
+    DeepSet.load,
+    Actor.load,
+    load_metric,
+    load_neural_metric,
+    load_stable_baselines3,
+]
+
+
+@pytest.mark.parametrize("read", READERS)
+@pytest.mark.parametrize("path", [3, b"file", True, ["file"], object()])
+def test_what_is_no_path_is_said_in_one_line(read, path):
+    with pytest.raises(ValueError, match=r"must be the path of a file$"):
+        read(path)
