@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.cartpole_task import OBSERVATION_DIM
+from lagros_envs.checks import shown
+from lagros_envs.options import real_numbers
 
 Number = TypeVar("Number", np.float32, np.float64)
 
@@ -19,14 +21,17 @@ def as_numbers(observation: Any, dtype: type[Number]) -> NDArray[Number]:
     """Return an observation as an array; it is not copied where it is one already.
 
     Raises:
-        ValueError: It is not made of numbers.
+        ValueError: It is not made of numbers, as text, truth values and masked arrays are not.
     """
-    try:
+    if type(observation) is np.ndarray and observation.dtype.char in "fd":
         return np.asarray(observation, dtype)
-    except (TypeError, ValueError) as error:
+    numbers = real_numbers(observation)
+    if numbers is None:
         raise ValueError(
-            f"the observation is a {type(observation).__name__}, not an array of numbers ({error})"
-        ) from error
+            f"the observation is a {type(observation).__name__} that is no array of numbers: "
+            f"{shown(observation)}"
+        )
+    return numbers.astype(dtype)
 
 
 def cartpole_rows(observation: Any, dtype: type[Number]) -> NDArray[Number]:

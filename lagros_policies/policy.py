@@ -102,6 +102,8 @@ def row_memories(
             "or None at the start of an episode"
         )
     starts = np.zeros(count, bool) if episode_start is None else np.ravel(episode_start)
+    if starts.dtype.kind not in "biuf":
+        raise ValueError(f"episode_start={shown(episode_start)} must be True or False for each row")
     if len(memories) != count or len(starts) != count:
         raise ValueError(
             f"state remembers {len(memories)} {rows} and episode_start is for {len(starts)}; "

@@ -83,7 +83,7 @@ class Sensed(NamedTuple):
             The parts, in double precision.
 
         Raises:
-            ValueError: The observation has another shape or is not finite.
+            ValueError: The observation has another shape, no rows, or is not finite.
         """
         rows = as_numbers(observation, np.float64)
         if rows.ndim == 1:
@@ -94,8 +94,7 @@ class Sensed(NamedTuple):
                 f"neighbours and {layout.obstacles} obstacles at most it has {layout.size} numbers:"
                 " build the policy with the environment's preset and num_agents"
             )
-        if not np.isfinite(rows).all():
-            raise ValueError("the observation is not finite")
+        _check_rows(rows)
         at, count = layout.slices, len(rows)
         return cls(
             rows[:, : at["neighbours"].start],
@@ -136,7 +135,8 @@ class WorldState(NamedTuple):
             The parts, in double precision.
 
         Raises:
-            ValueError: The observation has another shape, is not finite, or is no global state.
+            ValueError: The observation has another shape, no rows, is not finite, or is no global
+                state.
         """
         ends = np.cumsum(
             [1, STATE_DIM * agents, 2 * agents, OBSTACLE_DIM * obstacles, obstacles]
@@ -150,8 +150,7 @@ class WorldState(NamedTuple):
                 f" and up to {obstacles} obstacles has {ends[-1]} numbers: build the policy with "
                 "the environment's preset and num_agents, and its filter too"
             )
-        if not np.isfinite(rows).all():
-            raise ValueError("the observation is not finite")
+        _check_rows(rows)
         time, states, goals, discs, mask = np.split(rows, ends[:-1], axis=1)
         if not np.isin(mask, (0.0, 1.0)).all():
             raise ValueError(
@@ -166,3 +165,10 @@ class WorldState(NamedTuple):
             discs.reshape(worlds, obstacles, OBSTACLE_DIM),
             mask > 0.0,
         )
+
+
+def _check_rows(rows: FloatArray) -> None:
+    if not len(rows):
+        raise ValueError("the observation has no rows: no one is there to act")
+    if not np.isfinite(rows).all():
+        raise ValueError("the observation is not finite")

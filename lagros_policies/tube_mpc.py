@@ -129,12 +129,9 @@ class TubeMpcPolicy:
         )
         # Copies: what was returned before stays what it was.
         fresh = [TubeMpcState() if memory is None else copy(memory) for memory in memories]
-        force = np.array(
-            [
-                self._applied(self._force(row, memory), memory)
-                for row, memory in zip(rows, fresh, strict=True)
-            ]
-        )
+        force = np.empty((len(rows), 1))
+        for place, row, memory in zip(force, rows, fresh, strict=True):
+            place[:] = self._applied(self._force(row, memory), memory)
         action = (force / self.settings.force_scale).astype(np.float32)
         return (action if np.ndim(observation) == 2 else action[0]), fresh
 

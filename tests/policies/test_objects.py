@@ -167,6 +167,8 @@ def test_what_is_no_observation_is_refused(task, name):
             spoiled.append(bad)
     shapes = [row[..., :-1], np.concatenate([row, row], axis=-1), row[None, None], row[..., 0]]
     others = ["text", None, {"agent_0": row}, [[1.0], [1.0, 2.0]], np.float32(1.0), object()]
+    others += [row.astype(kind) for kind in (str, bool, object, complex)]
+    others += [np.ma.masked_array(row, mask=True), row.astype(bool).tolist()]
     for bad in (*spoiled, *shapes, *others):
         with pytest.raises(ValueError, match="observation") as caught:
             policy.predict(bad)
@@ -174,6 +176,19 @@ def test_what_is_no_observation_is_refused(task, name):
     # And nothing is left behind.
     action, _ = policy.predict(row)
     assert np.isfinite(action).all()
+
+
+@each
+def test_a_batch_of_no_rows_has_no_actions_or_is_refused(task, name):
+    row = seen(task, name)[0]
+    policy = built(task, name)
+    none = (row if row.ndim == 2 else row[None])[:0]
+    if task == "spacecraft":
+        with pytest.raises(ValueError, match="the observation has no rows"):
+            policy.predict(none)
+        return
+    action, _ = policy.predict(none)
+    assert (action.shape, action.dtype) == ((0, 1), np.float32)
 
 
 @each

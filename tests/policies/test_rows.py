@@ -40,3 +40,14 @@ def test_the_task_is_the_papers_and_the_preset_has_the_agents_asked_for():
     assert preset.agents == 4
     with pytest.raises(ValueError, match="preset='none such'"):
         task_and_preset(None, "none such", None)
+
+
+@pytest.mark.parametrize("starts", ["x", ["yes", "no"], [None, None], np.array([1j, 0])])
+def test_a_start_is_true_or_false(starts):
+    with pytest.raises(ValueError, match=r"episode_start=.* must be True or False"):
+        row_memories([None, None], starts, 2, "episodes", str)
+
+
+@pytest.mark.parametrize("starts", [[True, False], np.array([[1.0], [0.0]], np.float32), (1, 0)])
+def test_a_start_may_be_a_number(starts):
+    assert row_memories(["a", "b"], starts, 2, "episodes", str) == [None, "b"]
