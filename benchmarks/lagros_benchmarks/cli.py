@@ -216,7 +216,8 @@ def bench(
         )
         for name in settings.policies:
             check_policy(name, task)
-        outputs.check(task, settings.episodes, policy_files(settings.policies), {"--out": out})
+        files = policy_files(settings.policies)
+        outputs.check(task, settings.episodes, files, {"--out": out}, BENCH_FOLDER)
     except ValueError as error:
         fail(error)
     run_and_report(settings, outputs, out or BENCH_FOLDER, keep=out is not None)

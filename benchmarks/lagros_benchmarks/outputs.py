@@ -5,6 +5,7 @@ Only the standard library, typer and `extras` are imported here.
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
@@ -24,7 +25,10 @@ _ANY = ".lagros"  # a name that no file of ours has
 
 
 def check_outputs(
-    outputs: Paths, inputs: Paths | None = None, folders: Paths | None = None
+    outputs: Paths,
+    inputs: Paths | None = None,
+    folders: Paths | None = None,
+    kept: Path | None = None,
 ) -> tuple[Path, ...]:
     """Check by trying that all files of a command can be written, and make their folders.
 
@@ -32,15 +36,18 @@ def check_outputs(
         outputs: What the command writes.
         inputs: What it reads, and must not write over.
         folders: Where it writes files of its own choice.
+        kept: Folder where it keeps its work if it can, and goes on without if it cannot.
 
     Returns:
         The folders that were made.
 
     Raises:
-        ValueError: One cannot be written, two are one file, or one is what the command reads.
+        ValueError: One cannot be written, two are one file, one is a folder of another, or one is
+            what the command reads.
     """
     from lagros_envs.files import remove_folders
 
+    _check_nesting(outputs, {**(folders or {}), "finished work": kept})
     seen: dict[object, str] = {}
     for option, path in (inputs or {}).items():
         # What cannot be looked at is no file, and is refused by whoever reads it.
@@ -68,6 +75,26 @@ def check_outputs(
         remove_folders(made)
         raise
     return made
+
+
+def _check_nesting(outputs: Paths, folders: Paths) -> None:
+    """Check that no file has the name of a folder that another output needs.
+
+    Raises:
+        ValueError: One has.
+    """
+    needed = {option: path for option, path in folders.items() if path is not None}
+    needed |= {option: path.parent for option, path in outputs.items() if path is not None}
+    for option, path in outputs.items():
+        if path is None:
+            continue
+        file = os.path.realpath(path)
+        for other, folder in needed.items():
+            place = Path(os.path.realpath(folder))
+            if file in map(str, (place, *place.parents)):
+                raise ValueError(
+                    f"{option}: {str(path)!r} is a folder of {other}; name another file"
+                )
 
 
 def policy_files(policies: Iterable[str]) -> dict[str, Path]:

@@ -47,6 +47,7 @@ class Outputs:
         episodes: int | None = None,
         inputs: Paths | None = None,
         folders: Paths | None = None,
+        kept: Path | None = None,
     ) -> None:
         """Check the files before the run and not after it.
 
@@ -55,6 +56,7 @@ class Outputs:
             episodes: Its number of episodes; None leaves the scene's world unchecked.
             inputs: Files that the run reads, by the option that names them.
             folders: Where it writes files of its own choice, likewise.
+            kept: Where it keeps its work if it can.
 
         Raises:
             ValueError: A file cannot be written, two are one, a figure has an unknown suffix, or
@@ -77,7 +79,7 @@ class Outputs:
                     f"scene_world={self.scene_world!r} must be one of the run's worlds, 0 to "
                     f"{episodes - 1}"
                 )
-        check_outputs(self._paths, inputs, folders)
+        check_outputs(self._paths, inputs, folders, kept)
 
     @property
     def some(self) -> bool:

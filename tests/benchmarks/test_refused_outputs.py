@@ -179,6 +179,35 @@ def test_two_outputs_in_one_file_are_refused(refused, tmp_path, command, one, ot
     assert other in said
 
 
+@pytest.mark.parametrize(("command", "one", "other"), PAIRS)
+@pytest.mark.parametrize("linked", [False, True])
+def test_a_file_that_is_a_folder_of_another_is_refused(
+    refused, tmp_path, command, one, other, linked
+):
+    if linked:
+        (tmp_path / "short").symlink_to("x.png")
+    beneath = "short/deep/y.png" if linked else "x.png/deep/y.png"
+    for first, second in ((one, other), (other, one)):
+        said = refused([*START[command].split(), first, "x.png", second, beneath])
+        assert f"{first}:'x.png'isafolderof{second}" in said
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "bench cartpole --json a --out a",
+        "bench cartpole --csv a --out a/b",
+        "bench cartpole --markdown runs",
+        "bench cartpole --latex runs/bench",
+        "train cartpole --json runs/train",
+        "train cartpole --json a/cartpole-ppo/seed-0 --out a",
+    ],
+)
+def test_a_file_that_is_a_folder_of_the_run_is_refused(refused, arguments):
+    option, name = arguments.split()[2:4]
+    assert f"{option}:'{name}'isafolderof" in refused(arguments.split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "option"),
     [
