@@ -111,7 +111,7 @@ def check_trained_for(
         if needed is not None:
             raise ValueError(
                 f"{name}={value!r}: {what} was made for {needed}; use what was made for this task, "
-                "or pass allow_other_settings=True to fly outside of that"
+                "or give lagros_policies.make allow_other_settings=True to fly outside of that"
             )
 
 

@@ -57,7 +57,7 @@ class Command(TyperCommand):
     """A command that is known, while it runs, to what is said of its options."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Refuse what no option can mean: nothing at all, and what no system takes in a name."""
+        """Refuse what no option can mean: nothing at all, what no system takes in a name, two."""
         for before, argument in zip(["", *args], args, strict=False):
             option, equals, value = argument.partition("=")
             if not (equals and option.startswith("--")):
@@ -69,7 +69,32 @@ class Command(TyperCommand):
                     ctx=ctx,
                     param_hint=repr(option if option.startswith("--") else self.name),
                 )
+        self._refuse_twice(ctx, args)
         return super().parse_args(ctx, args)
+
+    def _refuse_twice(self, ctx: Any, args: list[str]) -> None:
+        """Refuse an option that stands twice, of which only the last value would count."""
+        takes_value = {
+            name
+            for parameter in self.params
+            if not (getattr(parameter, "is_flag", False) or parameter.multiple)
+            for name in parameter.opts
+        }
+        given: set[str] = set()
+        left = iter(args)
+        for argument in left:
+            option, equals, _ = argument.partition("=")
+            if argument == "--":
+                return
+            if option not in takes_value or not option.startswith("--"):
+                continue
+            if option in given:
+                raise typer.BadParameter(
+                    "it stands twice; give it once", ctx=ctx, param_hint=repr(option)
+                )
+            given.add(option)
+            if not equals:
+                next(left, None)
 
     def invoke(self, context: Any) -> Any:
         """Run it."""

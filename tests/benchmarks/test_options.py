@@ -341,6 +341,24 @@ def test_an_unknown_option_and_an_argument_too_many_are_refused(invoke, name):
         assert "Traceback" not in result.output
 
 
+VALUED = [
+    (name, option)
+    for name, command in commands()
+    for parameter in command.params
+    for option in parameter.opts
+    if option.startswith("--") and not parameter.is_flag
+]
+
+
+@pytest.mark.parametrize(("name", "option"), VALUED)
+def test_an_option_that_stands_twice_is_refused(invoke, name, option):
+    for twice in ([option, "1", option, "1"], [f"{option}=1", f"{option}=2"]):
+        arguments = [*words(name, ROWS[name][option].bases[0]), *twice]
+        result = invoke(arguments)
+        check_refused(result, option, arguments)
+        assert "stands twice" in result.output
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from lagros_benchmarks import cli
 from lagros_benchmarks.certify_evidence import load_axis_metric
+from lagros_benchmarks.files import plain
 from lagros_benchmarks.training.run import Place, train
 from lagros_benchmarks.training.settings import CartPoleTraining
 from lagros_benchmarks.worst_case import attack
@@ -225,6 +226,16 @@ def test_a_damaged_record_of_a_training_run_is_named(tmp_path, text):
         train(CartPoleTraining(), place, lambda: pytest.fail("it began"))
     assert "\n" not in str(error.value)
     assert str(tmp_path) in str(error.value)
+
+
+@pytest.mark.parametrize("value", [["x"], [True], [[1.0]], [{}], [1.0, 2.0], [], 1.0, None])
+def test_a_point_of_a_stored_curve_is_a_number(tmp_path, value):
+    run, place = CartPoleTraining(segments=1), Place(tmp_path)
+    curve = {key: [1.0] for key in ("steps", "seconds", "cpu_seconds")} | {"fallen": value}
+    stored = {"training": plain(run.record()), "curve": curve, "final": []}
+    place.record.write_text(json.dumps(stored))
+    with pytest.raises(ValueError, match=r"record\.json.*'fallen'"):
+        train(run, place, lambda: pytest.fail("it began"))
 
 
 def make_shard(index: int):

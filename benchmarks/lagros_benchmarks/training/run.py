@@ -183,7 +183,10 @@ def _check_figures(found: Record, segments: int) -> None:
     for axis in AXES:
         curve.array(axis, (segments,))
     for name in curve.entries:
-        if len(curve.list(name)) != segments:
+        points = curve.list(name)
+        # What is not finite is null: an effort to success where there was none.
+        known = all(point is None or is_finite(point) for point in points)
+        if len(points) != segments or not known:
             raise ValueError(f"{curve.name}: {name!r} must have one number for each segment")
     for index, figures in enumerate(found.list("final")):
         Record(figures, f"{found.name}: 'final' {index}")
