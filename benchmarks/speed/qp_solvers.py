@@ -7,17 +7,19 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import osqp
 import piqp
 from numpy.typing import NDArray
 from scipy import sparse
 
 from lagros_policies.planning import scp
 from lagros_policies.planning.qp import (
-    UNBOUNDED,
     QpSolution,
     QuadraticProgram,
+    osqp_rows,
+    osqp_solver,
+    read_osqp,
     solve_with_clarabel,
+    solve_with_osqp,
     solve_with_piqp,
 )
 
@@ -29,7 +31,6 @@ Solver = Callable[[QuadraticProgram], QpSolution]
 
 # The default of ScpSettings.
 TOLERANCE = 1e-8
-_MOST_ITERATIONS = 50_000
 
 
 def solvers() -> dict[str, Solver]:
@@ -50,7 +51,7 @@ def solvers() -> dict[str, Solver]:
 def planning_with(solver: Solver) -> Iterator[None]:
     """Let the planner solve its quadratic programs with another solver."""
     original = scp.solve_qp
-    scp.solve_qp = lambda program, _: solver(program)
+    scp.solve_qp = lambda program, *_: solver(program)
     try:
         yield
     finally:
@@ -92,16 +93,16 @@ class KeptOsqp:
 
     def __call__(self, program: QuadraticProgram) -> QpSolution:
         """Solve."""
-        rows, low, high = _osqp_rows(program)
+        rows, low, high = osqp_rows(program)
         solver = self._kept.get(program.cost_diagonal.size)
         if solver is None:
-            solver = _osqp(program, rows, low, high, self._tolerance)
+            solver = osqp_solver(program, rows, low, high, self._tolerance)
             self._kept[program.cost_diagonal.size] = solver
         else:
             solver.update(
                 q=program.cost_linear, l=low, u=high, Px=program.cost_diagonal, Ax=rows.data
             )
-        return _osqp_answer(solver)
+        return read_osqp(solver)
 
 
 def solve_with_multistage(program: QuadraticProgram) -> QpSolution:
@@ -110,11 +111,6 @@ def solve_with_multistage(program: QuadraticProgram) -> QpSolution:
     solver.settings.kkt_solver = piqp.KKTSolver.sparse_multistage
     _set_up(solver, program)
     return _answer(solver)
-
-
-def solve_with_osqp(program: QuadraticProgram, tolerance: float) -> QpSolution:
-    """Solve with OSQP (operator splitting, first order)."""
-    return _osqp_answer(_osqp(program, *_osqp_rows(program), tolerance))
 
 
 def objective(program: QuadraticProgram, values: FloatArray) -> float:
@@ -160,39 +156,3 @@ def _set_up(solver: Any, program: QuadraticProgram) -> None:
 def _answer(solver: Any) -> QpSolution:
     status = solver.solve()
     return QpSolution(np.array(solver.result.x), status == piqp.PIQP_SOLVED, status.name)
-
-
-def _osqp_rows(program: QuadraticProgram) -> tuple[sparse.csc_matrix, FloatArray, FloatArray]:
-    bounded = np.flatnonzero((program.low > -UNBOUNDED) | (program.high < UNBOUNDED))
-    identity = sparse.eye(program.cost_diagonal.size, format="csc")
-    rows = sparse.vstack([program.equality, identity[bounded]], format="csc")
-    low = np.concatenate([program.target, program.low[bounded]])
-    return rows, low, np.concatenate([program.target, program.high[bounded]])
-
-
-def _osqp(
-    program: QuadraticProgram,
-    rows: sparse.csc_matrix,
-    low: FloatArray,
-    high: FloatArray,
-    tolerance: float,
-) -> Any:
-    solver = osqp.OSQP()
-    solver.setup(
-        _diagonal(program),
-        program.cost_linear,
-        rows,
-        low,
-        high,
-        eps_abs=tolerance,
-        eps_rel=tolerance,
-        max_iter=_MOST_ITERATIONS,
-        verbose=False,
-    )
-    return solver
-
-
-def _osqp_answer(solver: Any) -> QpSolution:
-    result = solver.solve()
-    solved = result.info.status == "solved" and bool(np.all(np.isfinite(result.x)))
-    return QpSolution(np.array(result.x), solved, result.info.status)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,8 @@ from lagros_envs.cartpole_task import FALL_ANGLE, CartPoleSettings
 from lagros_envs.checks import check_fields, check_positive
 from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_policies.contraction.tube import tighten
-from lagros_policies.planning.scp import ScpSettings, ScpSolver
+from lagros_policies.planning.problem import Problem
+from lagros_policies.planning.scp import ScpSettings, solve_scp
 from lagros_policies.planning.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
@@ -67,11 +68,8 @@ class CartPolePlanner:
         """Remember task and settings."""
         self.task = task or CartPoleSettings()
         self.settings = settings or CartPolePlannerSettings()
-        problem = self.task.system, self.task.control_period, self.settings.scp
-        self._solver = ScpSolver(*problem)
         limit = self.task.force_limit
         self._largest = math.inf if limit is None else limit
-        self._limited = ScpSolver(*problem, self._largest)
 
     def angle_limit(self, time: FloatArray) -> FloatArray:
         """Return the tightened bound of |theta_d| [rad] at the times [s] (Theorem 3)."""
@@ -116,16 +114,31 @@ class CartPolePlanner:
                 f"start_step={start_step}"
             )
         times = self.task.control_period * np.arange(start_step + 1.0, self.task.steps)
-        high = np.full((horizon - 1, 4), np.inf)
-        high[:, ANGLE] = self.angle_limit(times)
-        warm = None
+        # At the end the state is given, not bounded.
+        high = np.full((horizon, 4), np.inf)
+        high[:-1, ANGLE] = self.angle_limit(times)
+        scp = self.settings.scp
+        problem = Problem(
+            self.task.system,
+            self.task.control_period,
+            horizon,
+            np.asarray(initial_state, np.float64),
+            np.asarray(goal, np.float64),
+            -high,
+            high,
+        )
+        warm, largest = None, self._largest
         if guess is not None:
             warm = guess.states[-(horizon + 1) :], guess.controls[-horizon:]
-        ends = np.asarray(initial_state, np.float64), np.asarray(goal, np.float64)
-        if guess is not None and np.max(np.abs(guess.controls)) <= self._largest + FORCE_SLACK:
-            return self._limited.solve(*ends, -high, high, warm)
-        plan = self._solver.solve(*ends, -high, high, warm)
-        if not plan.solved or np.max(np.abs(plan.controls)) <= self._largest + FORCE_SLACK:
-            return plan
-        # From a straight line the linearised dynamics may ask for more than the limit.
-        return self._limited.solve(*ends, -high, high, (plan.states, plan.controls))
+        if guess is None or not self._keeps(guess) or math.isinf(largest):
+            # From a straight line the linearised dynamics may ask for more than the limit.
+            plan = solve_scp(problem, warm, scp)
+            if not plan.solved or self._keeps(plan):
+                return plan
+            warm = plan.states, plan.controls
+        low, high = np.array(-largest), np.array(largest)
+        return solve_scp(replace(problem, control_low=low, control_high=high), warm, scp)
+
+    def _keeps(self, plan: Trajectory) -> bool:
+        """Return whether a plan keeps the force limit."""
+        return bool(np.max(np.abs(plan.controls)) <= self._largest + FORCE_SLACK)

@@ -1,12 +1,14 @@
-"""Sparse quadratic programs: PIQP, and Clarabel where PIQP gives up.
+"""Sparse quadratic programs, by the solver of one's choice, and Clarabel where that gives up.
 
-Both solve min z'Pz/2 + c'z subject to Az = b and low <= z <= high. Which solver stands first was
+All solve min z'Pz/2 + c'z subject to Az = b and low <= z <= high. Which solver stands first was
 measured; see `benchmarks/speed/programs.py`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import clarabel  # at once: a fallback that is missing must not show in the middle of an episode
 import numpy as np
@@ -14,10 +16,15 @@ import piqp
 from numpy.typing import NDArray
 from scipy import sparse
 
+from lagros_envs.checks import check_name
+
 FloatArray = NDArray[np.float64]
+QpSolver = Literal["piqp", "clarabel", "osqp"]
 
 # Bounds at least this large are taken for absent by both solvers.
 UNBOUNDED = 1e30
+# A first-order method needs thousands where interior points need a dozen.
+_MOST_OSQP_ITERATIONS = 50_000
 
 
 @dataclass(frozen=True)
@@ -56,25 +63,35 @@ class QpSolution:
     status: str
 
 
-def solve_qp(program: QuadraticProgram, tolerance: float) -> QpSolution:
-    """Solve with PIQP, and with Clarabel if PIQP does not reach the tolerance."""
-    solution = solve_with_piqp(program, tolerance)
-    return solution if solution.solved else solve_with_clarabel(program, tolerance)
+def solve_qp(program: QuadraticProgram, tolerance: float, solver: QpSolver = "piqp") -> QpSolution:
+    """Solve with a solver by name, and with Clarabel if that does not reach the tolerance.
+
+    Args:
+        program: The program.
+        tolerance: Residual that counts as none.
+        solver: "piqp", "clarabel" or "osqp".
+
+    Raises:
+        ValueError: There is no such solver.
+        ImportError: OSQP is asked for and not installed.
+    """
+    if solver not in SOLVERS:
+        check_name("solver", solver, SOLVERS)
+    solution = SOLVERS[solver](program, tolerance)
+    if solution.solved or solver == "clarabel":
+        return solution
+    return solve_with_clarabel(program, tolerance)
 
 
 def solve_with_piqp(program: QuadraticProgram, tolerance: float) -> QpSolution:
     """Solve with PIQP (proximal interior point)."""
-    size = program.cost_diagonal.size
     solver = piqp.SparseSolver()
     solver.settings.eps_abs = tolerance
     solver.settings.eps_rel = tolerance
     # The primal and dual residuals are what the plan needs; the gap costs an iteration.
     solver.settings.check_duality_gap = False
-    diagonal = sparse.csc_matrix(
-        (program.cost_diagonal, np.arange(size), np.arange(size + 1)), shape=(size, size)
-    )
     solver.setup(
-        diagonal,
+        _diagonal(program),
         program.cost_linear,
         program.equality,
         program.target,
@@ -111,3 +128,74 @@ def solve_with_clarabel(program: QuadraticProgram, tolerance: float) -> QpSoluti
     values = np.array(answer.x)
     solved = answer.status == clarabel.SolverStatus.Solved and bool(np.all(np.isfinite(values)))
     return QpSolution(values, solved, f"Clarabel: {answer.status}")
+
+
+def solve_with_osqp(program: QuadraticProgram, tolerance: float) -> QpSolution:
+    """Solve with OSQP (operator splitting, first order): cheap where little precision is asked.
+
+    Raises:
+        ImportError: OSQP is not installed.
+    """
+    return read_osqp(osqp_solver(program, *osqp_rows(program), tolerance))
+
+
+SOLVERS: dict[QpSolver, Callable[[QuadraticProgram, float], QpSolution]] = {
+    "piqp": solve_with_piqp,
+    "clarabel": solve_with_clarabel,
+    "osqp": solve_with_osqp,
+}
+
+
+def osqp_rows(program: QuadraticProgram) -> tuple[sparse.csc_matrix, FloatArray, FloatArray]:
+    """Return equalities and bounds as rows with a lower and an upper limit."""
+    bounded = np.flatnonzero((program.low > -UNBOUNDED) | (program.high < UNBOUNDED))
+    identity = sparse.eye(program.cost_diagonal.size, format="csc")
+    rows = sparse.vstack([program.equality, identity[bounded]], format="csc")
+    low = np.concatenate([program.target, program.low[bounded]])
+    return rows, low, np.concatenate([program.target, program.high[bounded]])
+
+
+def osqp_solver(
+    program: QuadraticProgram,
+    rows: sparse.csc_matrix,
+    low: FloatArray,
+    high: FloatArray,
+    tolerance: float,
+) -> Any:
+    """Return OSQP, set up for a program with the rows of `osqp_rows`.
+
+    Raises:
+        ImportError: OSQP is not installed.
+    """
+    try:
+        import osqp
+    except ImportError as error:
+        raise ImportError("the solver 'osqp' is not installed: pip install osqp") from error
+    solver = osqp.OSQP()
+    solver.setup(
+        _diagonal(program),
+        program.cost_linear,
+        rows,
+        low,
+        high,
+        eps_abs=tolerance,
+        eps_rel=tolerance,
+        max_iter=_MOST_OSQP_ITERATIONS,
+        verbose=False,
+    )
+    return solver
+
+
+def read_osqp(solver: Any) -> QpSolution:
+    """Run OSQP and return its answer."""
+    result = solver.solve(raise_error=False)
+    values = np.array(result.x)
+    solved = result.info.status == "solved" and bool(np.all(np.isfinite(values)))
+    return QpSolution(values, solved, f"OSQP: {result.info.status}")
+
+
+def _diagonal(program: QuadraticProgram) -> sparse.csc_matrix:
+    size = program.cost_diagonal.size
+    return sparse.csc_matrix(
+        (program.cost_diagonal, np.arange(size), np.arange(size + 1)), shape=(size, size)
+    )

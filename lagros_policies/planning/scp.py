@@ -1,11 +1,15 @@
 """Sequential convex programming with a trust region for least-effort trajectories.
 
-The problem is the paper's (19): min of the integral of ||u||^2 subject to the dynamics, a fixed
-initial state, a fixed terminal state, bounds on the states in between and, where there is a limit,
-on the controls. Each pass linearises the held Runge-Kutta dynamics, solves one sparse quadratic
-program, and accepts the step if it lowers an exact penalty of the true problem. The defects are
-those of the true dynamics at every pass; the slopes come from a coarser Runge-Kutta step, which
-moves the limit by far less than the tolerance on effort and halves the cost of a pass.
+The problem is the paper's (19): min of the integral of ||u - u_ref||^2 subject to the dynamics, a
+given initial state, a given terminal state, bounds on states and controls, and distances from
+discs; see `problem`. Each pass linearises the held Runge-Kutta dynamics and the distances, solves
+one sparse quadratic program, and accepts the step if it lowers an exact penalty of the true
+problem. The defects are those of the true dynamics at every pass; the slopes come from a coarser
+Runge-Kutta step, which moves the limit by far less than the tolerance on effort and halves the cost
+of a pass.
+
+A disc is imposed at the nodes, as the half-plane beside it that the last trajectory points at. By
+as much as the trajectory comes nearer between two nodes than it is at them, both must keep more.
 """
 
 from __future__ import annotations
@@ -15,249 +19,303 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
-from lagros_envs.checks import check_above, check_fields
-from lagros_envs.dynamics import System, hold_step, linearise_hold
-from lagros_policies.planning.qp import UNBOUNDED, QuadraticProgram, solve_qp
+from lagros_envs.checks import check_above, check_fields, check_not_negative
+from lagros_envs.dynamics import hold_step, linearise_hold
+from lagros_envs.dynamics.integrate import SUBSTEPS
+from lagros_policies.planning.grid_path import segment_distance
+from lagros_policies.planning.problem import DISTANCE_SLACK, Problem
+from lagros_policies.planning.program import Linearisation, Programs
+from lagros_policies.planning.qp import QpSolver, solve_qp
 from lagros_policies.planning.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+
+# Shares of a step that are tried in turn where the trust region alone is slow to find a decrease.
+_SHARES = (0.5, 0.25, 0.125)
 
 
 @dataclass(frozen=True, slots=True)
 class ScpSettings:
-    """How long and how precisely to iterate.
+    """How long and how precisely to iterate. Scales are those of the problem.
 
     Attributes:
         max_iterations: Quadratic programs at most.
         defect_tolerance: Largest violation of the true dynamics of an accepted plan.
-        step_tolerance: Stop when no state (and no control, times the period) moves by more.
+        effort_tolerance: Once a pass lowers the merit by less than this share of it, the trust
+            region closes until the step is below its tolerance; zero for never.
+        step_tolerance: Stop when no state (and no control, times the period) moves by more, in
+            scales.
         qp_tolerance: Residual of the quadratic programs.
         trust_weight: Weight of the squared step, the trust region in its penalty form, at first.
         trust_weight_max: Give up when the weight that a decrease would need exceeds this.
-        penalty: Weight of the violation of the dynamics in the merit function.
+        line_search_weight: From this trust weight on, a step that does not lower the merit is
+            shortened before the weight grows.
+        keep_weight: Whether the trust weight stays, and does not fall, after a step that was
+            accepted at the second attempt or later.
+        penalty: Weight of violations, in scales, in the merit function.
         slope_substeps: Runge-Kutta substeps behind the slopes.
+        disc_reach: Discs are imposed at nodes nearer than required plus this many scales.
+        disc_spare: How much more than required is asked for at the nodes, in scales.
+        qp_solver: Which solver is asked first.
 
     Raises:
-        ValueError: A value is not positive.
+        ValueError: A value is not positive, or the solver is not known.
     """
 
     max_iterations: int = 60
     defect_tolerance: float = 1e-7
+    effort_tolerance: float = 0.0
     step_tolerance: float = 1e-3
     qp_tolerance: float = 1e-8
     trust_weight: float = 1e-3
     trust_weight_max: float = 1e6
+    line_search_weight: float = 1.0
+    keep_weight: bool = False
     penalty: float = 1e3
     slope_substeps: int = 2
+    disc_reach: float = 1.0
+    disc_spare: float = 1e-3
+    qp_solver: QpSolver = "piqp"
 
     def __post_init__(self) -> None:
         """Check the values."""
         check_fields(self)
         for item in fields(self):
-            check_above(item.name, getattr(self, item.name), 0)
+            if item.name in ("disc_spare", "effort_tolerance"):
+                check_not_negative(item.name, getattr(self, item.name))
+            elif item.name not in ("keep_weight", "qp_solver"):
+                check_above(item.name, getattr(self, item.name), 0)
 
 
 @dataclass(frozen=True)
-class _Layout:
-    """Where the unknowns z = [u_0, x_1, u_1, x_2, ...] and the equality's entries lie."""
+class _Point:
+    """A trajectory of an iteration, with what is known of it.
 
-    controls: IntArray  # (N, m) places of u_k in z
-    states: IntArray  # (N, n) places of x_{k+1} in z
-    indices: IntArray  # rows of the compressed columns of the equality
-    pointers: IntArray  # column pointers
-    order: IntArray  # permutation from assembly order to compressed columns
-
-
-def _layout(horizon: int, n: int, m: int) -> _Layout:
-    stage = np.arange(horizon)[:, None] * (n + m)
-    controls = stage + np.arange(m)
-    states = stage + m + np.arange(n)
-    row = np.arange(horizon)[:, None] * n + np.arange(n)
-    # Assembly order: the identity on x_{k+1}, then -B_k on u_k, then -A_k on x_k for k >= 1.
-    rows = [
-        row.ravel(),
-        np.repeat(row[:, :, None], m, axis=2).ravel(),
-        np.repeat(row[1:, :, None], n, axis=2).ravel(),
-    ]
-    columns = [
-        states.ravel(),
-        np.repeat(controls[:, None, :], n, axis=1).ravel(),
-        np.repeat(states[:-1, None, :], n, axis=1).ravel(),
-    ]
-    place = np.concatenate(rows), np.concatenate(columns)
-    numbered = sparse.csc_matrix(
-        (np.arange(1, place[0].size + 1), place), shape=(horizon * n, horizon * (n + m))
-    )
-    return _Layout(controls, states, numbered.indices, numbered.indptr, numbered.data - 1)
-
-
-class ScpSolver:
-    """Plans least-effort trajectories of one system at one control period.
-
-    Args:
-        system: The system.
-        period: Control period [s].
-        settings: How to iterate.
-        control_limit: Largest magnitude of each control.
+    Attributes:
+        states: x_0 ... x_N, shape (N + 1, n).
+        controls: u_0 ... u_{N-1}, shape (N, m).
+        following: F(x_k, u_k), shape (N, n).
+        required: Distances that the nodes must keep, shape (N + 1, k), or None without discs.
+        clearance: Least distance beyond what the problem requires.
+        merit: Effort plus the weighted violations.
     """
 
-    def __init__(
-        self,
-        system: System,
-        period: float,
-        settings: ScpSettings | None = None,
-        control_limit: float = math.inf,
-    ) -> None:
-        """Remember the problem's constants."""
-        self.system = system
-        self.period = period
-        self.control_limit = min(control_limit, UNBOUNDED)
-        self.settings = settings or ScpSettings()
-        # The sparsity of each horizon met so far.
-        self._layouts: dict[int, _Layout] = {}
+    states: FloatArray
+    controls: FloatArray
+    following: FloatArray
+    required: FloatArray | None
+    clearance: float
+    merit: float
 
-    def solve(
-        self,
-        initial_state: FloatArray,
-        terminal_state: FloatArray,
-        low: FloatArray,
-        high: FloatArray,
-        guess: tuple[FloatArray, FloatArray] | None = None,
-    ) -> Trajectory:
-        """Plan from one state to another.
+    @property
+    def defect(self) -> float:
+        """Largest violation of the dynamics."""
+        return float(np.max(np.abs(self.following - self.states[1:])))
 
-        Args:
-            initial_state: x_d(0), shape (n,).
-            terminal_state: x_d(T), shape (n,).
-            low: Lower bounds of x_1 ... x_{N-1}, shape (N - 1, n), which says N; -inf for none.
-            high: Upper bounds, likewise.
-            guess: States (N + 1, n) and controls (N, m) to start from; a straight line without.
 
-        Returns:
-            The plan; `solved` is False, and `status` says why, where it does not hold.
-        """
-        if guess is None:
-            horizon = len(low) + 1
-            states = np.linspace(initial_state, terminal_state, horizon + 1)
-            controls = np.zeros((horizon, self.system.control_dim))
-        else:
-            states, controls = guess[0].copy(), guess[1].copy()
-            # A warm start need not end where this problem ends: the linearisation pulls it there.
-            states[0], states[-1] = initial_state, terminal_state
-        bounds = _clean(low, -UNBOUNDED), _clean(high, UNBOUNDED)
-        return self._iterate(states, controls, bounds)
+def solve_scp(
+    problem: Problem,
+    guess: tuple[FloatArray, FloatArray] | None = None,
+    settings: ScpSettings | None = None,
+) -> Trajectory:
+    """Plan from a guess.
 
-    def _iterate(
-        self, states: FloatArray, controls: FloatArray, bounds: tuple[FloatArray, FloatArray]
-    ) -> Trajectory:
-        settings = self.settings
+    Args:
+        problem: What to plan.
+        guess: States (N + 1, n) and controls (N, m) to start from, which need not obey anything; a
+            straight line under the reference control without.
+        settings: How to iterate.
+
+    Returns:
+        The plan; `solved` is False, and `status` says why, where it does not hold.
+
+    Raises:
+        ValueError: The guess is misshapen or not finite.
+    """
+    return _Iteration(problem, settings or ScpSettings()).run(guess)
+
+
+class _Iteration:
+    """The passes over one problem."""
+
+    def __init__(self, problem: Problem, settings: ScpSettings) -> None:
+        self.problem, self.settings = problem, settings
+        self.programs = Programs(problem, settings.penalty, settings.disc_reach)
+        discs = problem.discs
+        self.required = None
+        if discs is not None and len(discs.centres) > 0:
+            self.axes = list(discs.position)
+            self.required = discs.required(problem.steps)
+            self.distance_scale = float(np.max(problem.state_scale[self.axes]))
+
+    def run(self, guess: tuple[FloatArray, FloatArray] | None) -> Trajectory:
+        settings, problem = self.settings, self.problem
         weight = settings.trust_weight
-        following = self._propagate(states, controls)
-        by_state, by_control = self._slopes(states, controls)
-        merit = self._merit(states, controls, following, bounds)
+        point = self._point(*self._begin(guess))
+        slopes = self._slopes(point)
         status = f"no convergence in {settings.max_iterations} quadratic programs"
         iterations = 0
-        solved = False
+        solved = closing = refused = False
         while iterations < settings.max_iterations:
-            program = self._program(
-                states, controls, following, by_state, by_control, bounds, weight
+            around = Linearisation(
+                point.states, point.controls, point.following, *slopes, point.required
             )
+            program = self.programs.around(around, weight)
             iterations += 1
-            answer = solve_qp(program, settings.qp_tolerance)
+            answer = solve_qp(program, settings.qp_tolerance, settings.qp_solver)
             if not answer.solved:
                 status = f"quadratic program {iterations} failed ({answer.status})"
                 break
-            layout = self._layouts[len(controls)]
-            new_states = np.vstack([states[:1], answer.values[layout.states]])
-            new_controls = answer.values[layout.controls]
-            new_following = self._propagate(new_states, new_controls)
-            new_merit = self._merit(new_states, new_controls, new_following, bounds)
-            step = max(
-                float(np.max(np.abs(new_states - states))),
-                self.period * float(np.max(np.abs(new_controls - controls))),
-            )
-            # Differences below the programs' own tolerance say nothing.
-            if not new_merit <= merit + 1e-6 * (1.0 + abs(merit)):
+            new, share = self._step(point, answer.values, weight)
+            if new is None:
+                refused = True
                 weight = max(8.0 * weight, 1e-2)
                 if weight > settings.trust_weight_max:
                     status = f"trust region exhausted at weight {weight:.0e}"
                     break
                 continue
-            states, controls, merit = new_states, new_controls, new_merit
-            following = new_following
-            weight = max(weight / 8.0, settings.trust_weight)
-            defect = float(np.max(np.abs(following - states[1:])))
-            if defect <= settings.defect_tolerance and step <= settings.step_tolerance:
+            step = self._length(point, new)
+            fell = point.merit - new.merit
+            settled = share == 1.0 and fell <= settings.effort_tolerance * new.merit
+            closing = closing or (settings.effort_tolerance > 0.0 and settled)
+            point = new
+            if closing:
+                weight = 8.0 * weight
+            elif not (refused and settings.keep_weight):
+                weight = max(weight / 8.0, settings.trust_weight)
+            refused = False
+            if (
+                share == 1.0
+                and step <= settings.step_tolerance
+                and point.defect <= settings.defect_tolerance
+                and point.clearance >= -DISTANCE_SLACK
+            ):
                 solved, status = True, "solved"
                 break
-            by_state, by_control = self._slopes(states, controls)
-        defect = float(np.max(np.abs(following - states[1:])))
-        return Trajectory(states, controls, self.period, solved, status, defect, iterations)
+            slopes = self._slopes(point)
+        return Trajectory(
+            point.states,
+            point.controls,
+            problem.period,
+            solved,
+            status,
+            point.defect,
+            iterations,
+            point.clearance,
+            problem.reference_control,
+        )
 
-    def _propagate(self, states: FloatArray, controls: FloatArray) -> FloatArray:
-        return hold_step(self.system, states[:-1], controls, self.period)
+    def _begin(self, guess: tuple[FloatArray, FloatArray] | None) -> tuple[FloatArray, FloatArray]:
+        problem = self.problem
+        given = problem.given_end
+        n, m = problem.system.state_dim, problem.system.control_dim
+        if guess is None:
+            end = np.where(given, problem.terminal_state, problem.initial_state)
+            states = np.linspace(problem.initial_state, end, problem.steps + 1)
+            return states, np.tile(problem.reference_control, (problem.steps, 1))
+        states, controls = (np.array(part, dtype=np.float64) for part in guess)
+        for name, part, shape in (
+            ("states", states, (problem.steps + 1, n)),
+            ("controls", controls, (problem.steps, m)),
+        ):
+            if part.shape != shape or not np.all(np.isfinite(part)):
+                raise ValueError(
+                    f"{name} of the guess, of shape {part.shape}, must be {shape} and finite"
+                )
+        # A warm start need not end where this problem ends: the linearisation pulls it there.
+        states[0] = problem.initial_state
+        states[-1, given] = problem.terminal_state[given]
+        return states, controls
 
-    def _slopes(self, states: FloatArray, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
-        substeps = self.settings.slope_substeps
+    def _step(
+        self, point: _Point, values: FloatArray, weight: float
+    ) -> tuple[_Point | None, float]:
+        """Return the step of a program or, where that alone lowers the merit, a share of it."""
+        following, controls = self.programs.states_and_controls(values)
+        states = np.vstack([point.states[:1], following])
+        # Differences below the programs' own tolerance say nothing.
+        allowed = point.merit + 1e-6 * (1.0 + abs(point.merit))
+        new = self._point(states, controls)
+        if new.merit <= allowed:
+            return new, 1.0
+        if weight >= self.settings.line_search_weight:
+            for share in _SHARES:
+                new = self._point(
+                    point.states + share * (states - point.states),
+                    point.controls + share * (controls - point.controls),
+                )
+                if new.merit < point.merit:
+                    return new, share
+        return None, 0.0
+
+    def _length(self, point: _Point, new: _Point) -> float:
+        """Return how far the trajectory moves, in scales; controls count times the period."""
+        problem = self.problem
+        states = np.max(np.abs(new.states - point.states) / problem.state_scale)
+        controls = np.max(np.abs(new.controls - point.controls) / problem.control_scale)
+        return max(float(states), problem.period * float(controls))
+
+    def _slopes(self, point: _Point) -> tuple[FloatArray, FloatArray]:
         _, by_state, by_control = linearise_hold(
-            self.system, states[:-1], controls, self.period, substeps
+            self.problem.system,
+            point.states[:-1],
+            point.controls,
+            self.problem.period,
+            self.settings.slope_substeps,
         )
         return by_state, by_control
 
-    def _merit(
-        self,
-        states: FloatArray,
-        controls: FloatArray,
-        following: FloatArray,
-        bounds: tuple[FloatArray, FloatArray],
-    ) -> float:
-        """Return effort plus the weighted violation of dynamics and bounds (exact penalty)."""
-        inner = states[1:-1]
-        violation = np.sum(np.abs(following - states[1:]))
-        violation += np.sum(np.maximum(bounds[0] - inner, 0.0))
-        violation += np.sum(np.maximum(inner - bounds[1], 0.0))
-        if self.control_limit < UNBOUNDED:
-            # A guess may exceed it; no program does.
-            violation += np.sum(np.maximum(np.abs(controls) - self.control_limit, 0.0))
-        return float(np.sum(controls**2) * self.period + self.settings.penalty * violation)
+    def _point(self, states: FloatArray, controls: FloatArray) -> _Point:
+        """Return a trajectory with its defects, its distances and its merit (exact penalty)."""
+        problem = self.problem
+        required, clearance, short = None, math.inf, 0.0
+        if self.required is None:
+            following = hold_step(problem.system, states[:-1], controls, problem.period)
+        else:
+            path = self._flow(states, controls)
+            following = path[-1]
+            required, clearance, short = self._distances(states, np.stack(path))
+        later, scale = states[1:], problem.state_scale
+        violation = np.sum(np.abs(following - later) / scale)
+        violation += np.sum(np.maximum(problem.state_low - later, 0.0) / scale)
+        violation += np.sum(np.maximum(later - problem.state_high, 0.0) / scale)
+        # A guess may exceed the bounds of the controls; no program does.
+        beyond = np.maximum(problem.control_low - controls, controls - problem.control_high)
+        violation += np.sum(np.maximum(beyond, 0.0) / problem.control_scale)
+        effort = np.sum((controls - problem.reference_control) ** 2) * problem.period
+        effort /= np.max(problem.control_scale) ** 2
+        merit = float(effort + self.settings.penalty * (violation + short))
+        return _Point(states, controls, following, required, clearance, merit)
 
-    def _program(
-        self,
-        states: FloatArray,
-        controls: FloatArray,
-        following: FloatArray,
-        by_state: FloatArray,
-        by_control: FloatArray,
-        bounds: tuple[FloatArray, FloatArray],
-        weight: float,
-    ) -> QuadraticProgram:
-        horizon, m = controls.shape
-        n = states.shape[1]
-        if horizon not in self._layouts:
-            self._layouts[horizon] = _layout(horizon, n, m)
-        layout = self._layouts[horizon]
-        entries = np.concatenate([np.ones(horizon * n), -by_control.ravel(), -by_state[1:].ravel()])
-        equality = sparse.csc_matrix(
-            (entries[layout.order], layout.indices, layout.pointers),
-            shape=(horizon * n, horizon * (n + m)),
-        )
-        offset = following - np.einsum("kij,kj->ki", by_control, controls)
-        offset[1:] -= np.einsum("kij,kj->ki", by_state[1:], states[1:-1])
-        reference = np.empty(horizon * (n + m))
-        reference[layout.controls] = controls
-        reference[layout.states] = states[1:]
-        diagonal = np.full(reference.size, weight)
-        diagonal[layout.controls] += 2.0 * self.period
-        low = np.full(reference.size, -UNBOUNDED)
-        high = np.full(reference.size, UNBOUNDED)
-        low[layout.states[:-1]], high[layout.states[:-1]] = bounds
-        low[layout.controls], high[layout.controls] = -self.control_limit, self.control_limit
-        low[layout.states[-1]] = high[layout.states[-1]] = states[-1]
-        return QuadraticProgram(diagonal, -weight * reference, equality, offset.ravel(), low, high)
+    def _flow(self, states: FloatArray, controls: FloatArray) -> list[FloatArray]:
+        """Return x_k, and the states after each Runge-Kutta step of its hold, each (N, n)."""
+        path = [states[:-1]]
+        for _ in range(SUBSTEPS):
+            step = self.problem.period / SUBSTEPS
+            path.append(hold_step(self.problem.system, path[-1], controls, step, substeps=1))
+        return path
 
+    def _distances(self, states: FloatArray, path: FloatArray) -> tuple[FloatArray, float, float]:
+        """Return what the nodes must keep, the least clearance, and the violation in scales.
 
-def _clean(bound: FloatArray, absent: float) -> FloatArray:
-    return np.where(np.isfinite(bound), bound, absent)
+        Args:
+            states: x_0 ... x_N, shape (N + 1, n).
+            path: States along the holds, shape (substeps + 1, N, n).
+        """
+        discs, required = self.problem.discs, self.required
+        assert discs is not None
+        assert required is not None
+        at_nodes = np.linalg.norm(states[:, None, self.axes] - discs.centres, axis=-1)
+        place = path[..., self.axes]
+        between = np.min(segment_distance(place[:-1], place[1:], discs.centres), axis=0)
+        nearer = np.maximum(np.minimum(at_nodes[:-1], at_nodes[1:]) - between, 0.0)
+        more = np.zeros_like(required)
+        more[:-1] = nearer
+        more[1:] = np.maximum(more[1:], nearer)
+        least = np.minimum(required[:-1], required[1:])
+        clearance = min(float(np.min(at_nodes - required)), float(np.min(between - least)))
+        asked = required + more + self.settings.disc_spare * self.distance_scale
+        inner = slice(1, -1) if np.all(self.problem.given_end[self.axes]) else slice(1, None)
+        short = np.maximum(asked - at_nodes, 0.0)[inner]
+        return asked, clearance, float(np.sum(short)) / self.distance_scale

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,9 @@ class Trajectory:
         status: Why the planner stopped, in words.
         defect: Largest violation of the true dynamics at any step, in units of the state.
         iterations: Convex programs solved.
+        clearance: Least distance from a disc beyond the required one, between the instants too;
+            inf where there is no disc.
+        reference_control: u_ref, from which effort is counted, shape (m,); zero if left out.
     """
 
     states: FloatArray
@@ -31,6 +35,8 @@ class Trajectory:
     status: str
     defect: float
     iterations: int
+    clearance: float = math.inf
+    reference_control: FloatArray | None = None
 
     @property
     def horizon(self) -> int:
@@ -39,5 +45,6 @@ class Trajectory:
 
     @property
     def effort(self) -> float:
-        """The integral of ||u_d||^2 over the plan."""
-        return float(np.sum(self.controls**2) * self.period)
+        """The integral of ||u_d - u_ref||^2 over the plan."""
+        reference = 0.0 if self.reference_control is None else self.reference_control
+        return float(np.sum((self.controls - reference) ** 2) * self.period)

@@ -1,4 +1,7 @@
-"""The two solvers of the quadratic programs against each other and the conditions of optimality."""
+"""The solvers of the quadratic programs against each other and the conditions of optimality."""
+
+import sys
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -7,16 +10,20 @@ from scipy import sparse
 from lagros_policies.planning import qp
 from lagros_policies.planning.qp import (
     UNBOUNDED,
+    QpSolver,
     QuadraticProgram,
     solve_qp,
     solve_with_clarabel,
+    solve_with_osqp,
     solve_with_piqp,
 )
 
 SOLVERS = [
     pytest.param(solve_with_piqp, id="PIQP"),
     pytest.param(solve_with_clarabel, id="Clarabel"),
+    pytest.param(solve_with_osqp, id="OSQP"),
 ]
+NAMES = {"piqp": "PIQP", "clarabel": "Clarabel", "osqp": "OSQP"}
 
 
 def random_program(seed, size=30, rows=12):
@@ -55,7 +62,7 @@ def kkt_residual(program, values):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_both_solvers_find_the_same_optimum(seed):
+def test_all_solvers_find_the_same_optimum(seed):
     program = random_program(seed)
     answers = [solver.values[0](program, 1e-9) for solver in SOLVERS]
     for answer in answers:
@@ -66,10 +73,27 @@ def test_both_solvers_find_the_same_optimum(seed):
         assert np.all(values <= program.high + 1e-6)
         assert kkt_residual(program, values) < 1e-3
     # PIQP is asked for its residuals and not for the gap: its optimum is less exact than they are.
-    assert answers[0].values == pytest.approx(answers[1].values, abs=1e-3)
-    first, second = answers[0].status, answers[1].status
-    assert first.startswith("PIQP")
-    assert second.startswith("Clarabel")
+    for answer in answers:
+        assert answer.values == pytest.approx(answers[1].values, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", get_args(QpSolver))
+def test_a_solver_is_asked_by_its_name(name):
+    program = random_program(2)
+    answer = solve_qp(program, 1e-9, name)
+    assert answer.status.startswith(NAMES[name])
+    assert answer.values == pytest.approx(solve_qp(program, 1e-9).values, abs=1e-3)
+
+
+def test_a_solver_that_is_not_known_is_refused():
+    with pytest.raises(ValueError, match=r"solver='pipq' must be one of .* Did you mean 'piqp'"):
+        solve_qp(random_program(0), 1e-8, "pipq")
+
+
+def test_a_solver_that_is_not_installed_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "osqp", None)
+    with pytest.raises(ImportError, match="pip install osqp"):
+        solve_qp(random_program(0), 1e-8, "osqp")
 
 
 def infeasible():
@@ -98,13 +122,13 @@ def test_numbers_that_are_not_finite_are_reported(solver):
     assert not solver(program, 1e-8).solved
 
 
-def test_clarabel_answers_where_piqp_gives_up(monkeypatch):
+@pytest.mark.parametrize("name", ["piqp", "osqp"])
+def test_clarabel_answers_where_another_gives_up(monkeypatch, name):
     program = random_program(1)
     sound = solve_qp(program, 1e-9)
-    assert sound.status.startswith("PIQP")
-    failed = qp.QpSolution(np.full(30, np.nan), False, "PIQP: gave up")
-    monkeypatch.setattr(qp, "solve_with_piqp", lambda program, tolerance: failed)
-    answer = solve_qp(program, 1e-9)
+    failed = qp.QpSolution(np.full(30, np.nan), False, "gave up")
+    monkeypatch.setitem(qp.SOLVERS, name, lambda program, tolerance: failed)
+    answer = solve_qp(program, 1e-9, name)
     assert answer.solved
     assert answer.status.startswith("Clarabel")
     assert answer.values == pytest.approx(sound.values, abs=1e-3)

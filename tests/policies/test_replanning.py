@@ -6,10 +6,9 @@ import pytest
 from lagros_envs.cartpole_task import FALL_ANGLE, CartPoleSettings
 from lagros_policies.distributed import DistributedTubeMpcPolicy
 from lagros_policies.expert import CartPoleExpert
-from lagros_policies.planning import CartPolePlanner
+from lagros_policies.planning import CartPolePlanner, Problem, solve_scp
 from lagros_policies.planning.cartpole import CartPolePlannerSettings
 from lagros_policies.planning.local_plan import LocalPlanner
-from lagros_policies.planning.scp import ScpSolver
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
 SHORT = CartPoleSettings(time_limit=3.0, goal_range=1.0)
@@ -72,17 +71,21 @@ def test_a_plan_that_begins_late_keeps_the_margin_of_its_time():
 
 def test_a_warm_start_beyond_the_bounds_is_left():
     planner = CartPolePlanner()
-    solver = ScpSolver(planner.task.system, 0.1)
     start, goal = np.array([0.0, 0.5, 0.0, 0.0]), np.array([2.0, 0.0, 0.0, 0.0])
-    none = np.full((39, 4), np.inf)
-    free = solver.solve(start, goal, -none, none)
+    none = np.full(4, np.inf)
+
+    def solve(sign, low, high, guess=None):
+        system = planner.task.system
+        return solve_scp(Problem(system, 0.1, 40, sign * start, sign * goal, low, high), guess)
+
+    free = solve(1.0, -none, none)
     assert free.solved
     for sign in (1.0, -1.0):  # the same problem and its mirror image, at the other bound
         high = none.copy()
-        high[:, 2] = 0.9 * np.max(free.states[1:-1, 2])
+        high[2] = 0.9 * np.max(free.states[1:-1, 2])
         low, high = (-none, high) if sign > 0.0 else (-high, none)
         guess = sign * free.states, sign * free.controls
-        plan = solver.solve(sign * start, sign * goal, low, high, guess)
+        plan = solve(sign, low, high, guess)
         assert plan.solved
         assert np.all(plan.states[1:-1] <= high + 1e-6)
         assert np.all(plan.states[1:-1] >= low - 1e-6)

@@ -1,0 +1,129 @@
+"""Two bodies among discs that the general planner is measured on: a car and a planar quadrotor.
+
+The systems and their limits are those of C3M (Sun, Jha & Fan 2021); the quadrotor's equations are
+those of Singh et al. (2017), with the velocity in the body's axes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.dynamics.system import Components
+from lagros_policies.planning import Discs, Problem
+
+FloatArray = NDArray[np.float64]
+
+GRAVITY = 9.81  # [m/s^2]
+BODY_RADIUS, MARGIN, DISC_RADIUS = 0.2, 0.15, 0.5
+
+
+@dataclass(frozen=True)
+class Car:
+    """[x, y, theta, v] under turn rate omega [rad/s] and acceleration a [m/s^2]."""
+
+    state_dim: int = 4
+    control_dim: int = 2
+
+    def derivative(self, state: Components, control: Components, functions: Any) -> Components:
+        """Return dx/dt."""
+        _, _, heading, speed = state
+        turn, acceleration = control
+        return speed * functions.cos(heading), speed * functions.sin(heading), turn, acceleration
+
+
+@dataclass(frozen=True)
+class Pvtol:
+    """[p_x, p_z, phi, v_x, v_z, dphi/dt] under the thrusts of two rotors [N]."""
+
+    mass: float = 0.486
+    inertia: float = 0.00383
+    arm: float = 0.25
+    gravity: float = GRAVITY
+    state_dim: int = 6
+    control_dim: int = 2
+
+    def derivative(self, state: Components, control: Components, functions: Any) -> Components:
+        """Return dx/dt."""
+        _, _, roll, along, up, rate = state
+        first, second = control
+        sine, cosine = functions.sin(roll), functions.cos(roll)
+        return (
+            along * cosine - up * sine,
+            along * sine + up * cosine,
+            rate,
+            up * rate - self.gravity * sine,
+            (first + second) / self.mass - along * rate - self.gravity * cosine,
+            self.arm * (first - second) / self.inertia,
+        )
+
+    @property
+    def hover(self) -> float:
+        """Thrust of each rotor that holds a hover [N]."""
+        return 0.5 * self.mass * self.gravity
+
+
+def car_problem(rng: np.random.Generator, period: float = 0.1) -> Problem:
+    """Return a random episode: 6 s across a field of discs, at 1 to 2 m/s."""
+    start = np.array([0.0, rng.uniform(-2.0, 2.0), rng.uniform(-0.5, 0.5), 1.5])
+    goal = np.array([9.0, rng.uniform(-2.0, 2.0), rng.uniform(-0.5, 0.5), 1.5])
+    discs = _discs(rng, start[:2], goal[:2], (1.5, 7.5), (-2.5, 2.5))
+    return Problem(
+        Car(),
+        period,
+        round(6.0 / period),
+        start,
+        goal,
+        state_low=np.array([-np.inf, -np.inf, -np.inf, 1.0]),
+        state_high=np.array([np.inf, np.inf, np.inf, 2.0]),
+        control_low=np.array([-3.0, -3.0]),
+        control_high=np.array([3.0, 3.0]),
+        discs=discs,
+    )
+
+
+def pvtol_problem(rng: np.random.Generator, period: float = 0.1) -> Problem:
+    """Return a random episode: 6 s from hover to hover across a field of discs."""
+    start, goal = np.zeros(6), np.zeros(6)
+    start[1], goal[:2] = rng.uniform(-1.5, 1.5), (6.0, rng.uniform(-1.5, 1.5))
+    discs = _discs(rng, start[:2], goal[:2], (1.2, 4.8), (-1.5, 1.5))
+    body = Pvtol()
+    tilt, largest = np.pi / 3.0, 2.0 * body.hover
+    high = np.array([np.inf, np.inf, tilt, 2.0, 1.0, tilt])
+    return Problem(
+        body,
+        period,
+        round(6.0 / period),
+        start,
+        goal,
+        state_low=-high,
+        state_high=high,
+        control_low=np.zeros(2),
+        control_high=np.full(2, largest),
+        reference_control=np.full(2, body.hover),
+        state_scale=np.array([1.0, 1.0, 0.3, 1.0, 1.0, 0.5]),
+        control_scale=np.full(2, 0.1),
+        discs=discs,
+    )
+
+
+def _discs(
+    rng: np.random.Generator,
+    start: FloatArray,
+    goal: FloatArray,
+    across: tuple[float, float],
+    aside: tuple[float, float],
+) -> Discs:
+    """Return three to five discs, all passages open, drawn again until they fit."""
+    keep = DISC_RADIUS + BODY_RADIUS + MARGIN
+    ends = np.stack([start, goal])
+    while True:
+        count = int(rng.integers(3, 6))
+        centres = np.stack([rng.uniform(*across, count), rng.uniform(*aside, count)], axis=-1)
+        apart = np.linalg.norm(centres[:, None] - centres, axis=-1) + 1e9 * np.eye(count)
+        gaps = np.linalg.norm(centres[:, None] - ends, axis=-1)
+        if np.all(apart >= 2.0 * keep) and np.all(gaps >= keep + 0.1):
+            return Discs(centres, np.array(DISC_RADIUS), BODY_RADIUS, np.array(MARGIN))

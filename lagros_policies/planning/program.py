@@ -1,0 +1,204 @@
+"""One quadratic program of the planner of one body: unknowns, linearised dynamics, half-planes.
+
+The unknowns are u_0, x_1, u_1, x_2, ... in units of the problem's scales, and two per half-plane:
+by how much it is violated and by how much it is kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from lagros_policies.planning.problem import Problem
+from lagros_policies.planning.qp import UNBOUNDED, QuadraticProgram
+from lagros_policies.planning.vectors import unit_vectors
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the unknowns and the entries of the linearised dynamics lie.
+
+    Attributes:
+        controls: Places of u_k, shape (N, m).
+        states: Places of x_{k+1}, shape (N, n).
+        indices: Rows of the compressed columns of the dynamics.
+        pointers: Their column pointers.
+        order: Permutation from assembly order to compressed columns.
+    """
+
+    controls: IntArray
+    states: IntArray
+    indices: IntArray
+    pointers: IntArray
+    order: IntArray
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """A trajectory, and the dynamics and discs around it, in the units of the state.
+
+    Attributes:
+        states: x_0 ... x_N, shape (N + 1, n).
+        controls: u_0 ... u_{N-1}, shape (N, m).
+        following: F(x_k, u_k), shape (N, n).
+        by_state: dF/dx, shape (N, n, n).
+        by_control: dF/du, shape (N, n, m).
+        required: Distances to keep from the discs at the nodes, shape (N + 1, k), or None.
+    """
+
+    states: FloatArray
+    controls: FloatArray
+    following: FloatArray
+    by_state: FloatArray
+    by_control: FloatArray
+    required: FloatArray | None = None
+
+
+@lru_cache(maxsize=256)
+def layout(steps: int, n: int, m: int) -> Layout:
+    """Return the layout of a program of N steps, n states and m controls."""
+    stage = np.arange(steps)[:, None] * (n + m)
+    controls = stage + np.arange(m)
+    states = stage + m + np.arange(n)
+    row = np.arange(steps)[:, None] * n + np.arange(n)
+    # Assembly order: the identity on x_{k+1}, then -B_k on u_k, then -A_k on x_k for k >= 1.
+    rows = [
+        row.ravel(),
+        np.repeat(row[:, :, None], m, axis=2).ravel(),
+        np.repeat(row[1:, :, None], n, axis=2).ravel(),
+    ]
+    columns = [
+        states.ravel(),
+        np.repeat(controls[:, None, :], n, axis=1).ravel(),
+        np.repeat(states[:-1, None, :], n, axis=1).ravel(),
+    ]
+    place = np.concatenate(rows), np.concatenate(columns)
+    numbered = sparse.csc_matrix(
+        (np.arange(1, place[0].size + 1), place), shape=(steps * n, steps * (n + m))
+    )
+    return Layout(controls, states, numbered.indices, numbered.indptr, numbered.data - 1)
+
+
+class Programs:
+    """The quadratic programs of one problem.
+
+    Args:
+        problem: What to plan.
+        penalty: Weight of a violated half-plane, in units of the scale of the position.
+        reach: A half-plane is imposed where a trajectory is nearer than the required distance plus
+            this many scales of the position.
+    """
+
+    def __init__(self, problem: Problem, penalty: float, reach: float) -> None:
+        """Compute what no pass changes."""
+        self.problem, self.penalty, self.reach = problem, penalty, reach
+        n, m, steps = problem.system.state_dim, problem.system.control_dim, problem.steps
+        self.place = place = layout(steps, n, m)
+        self._shape = steps * n, steps * (n + m)
+        x_scale, u_scale = problem.state_scale, problem.control_scale
+        self._ones = np.ones(steps * n)
+        self._by_state, self._by_control = (
+            scale / x_scale[:, None] for scale in (x_scale, u_scale)
+        )
+        # In units of the largest scale, so that effort and penalty stay comparable in all units.
+        self._effort = 2.0 * problem.period * (u_scale / np.max(u_scale)) ** 2
+        self._effortless = self._effort * (problem.reference_control / u_scale)
+        low, high = np.empty(self._shape[1]), np.empty(self._shape[1])
+        low[place.states], high[place.states] = problem.state_low, problem.state_high
+        low[place.controls], high[place.controls] = problem.control_low, problem.control_high
+        for bound in (low, high):
+            bound[place.states] /= x_scale
+            bound[place.controls] /= u_scale
+        self._low, self._high = np.maximum(low, -UNBOUNDED), np.minimum(high, UNBOUNDED)
+        self._given = problem.given_end
+        self._end = place.states[-1][self._given]
+
+    def states_and_controls(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return x_1 ... x_N, shape (N, n), and the controls (N, m) of a program's solution."""
+        states = values[self.place.states] * self.problem.state_scale
+        return states, values[self.place.controls] * self.problem.control_scale
+
+    def around(self, point: Linearisation, trust_weight: float) -> QuadraticProgram:
+        """Return the program around a trajectory.
+
+        Args:
+            point: The trajectory, linearised.
+            trust_weight: Weight of the squared step, in scales.
+        """
+        place, x_scale, u_scale = self.place, self.problem.state_scale, self.problem.control_scale
+        by_control = point.by_control * self._by_control
+        by_state = point.by_state[1:] * self._by_state
+        controls, states = point.controls / u_scale, point.states[1:] / x_scale
+        entries = np.concatenate([self._ones, -by_control.ravel(), -by_state.ravel()])
+        equality = sparse.csc_matrix(
+            (entries[place.order], place.indices, place.pointers), shape=self._shape
+        )
+        target = point.following / x_scale - np.einsum("kij,kj->ki", by_control, controls)
+        target[1:] -= np.einsum("kij,kj->ki", by_state, states[:-1])
+        linear = np.empty(self._shape[1])
+        linear[place.controls] = -trust_weight * controls - self._effortless
+        linear[place.states] = -trust_weight * states
+        diagonal = np.full(linear.size, trust_weight)
+        diagonal[place.controls] += self._effort
+        low, high = self._low.copy(), self._high.copy()
+        # The trajectory ends where the problem does, to within the solvers' tolerance.
+        low[self._end] = high[self._end] = states[-1][self._given]
+        program = QuadraticProgram(diagonal, linear, equality, target.ravel(), low, high)
+        return program if point.required is None else self._with_discs(program, point)
+
+    def _with_discs(self, program: QuadraticProgram, point: Linearisation) -> QuadraticProgram:
+        """Add n'p_k + violated - kept = R + n'o for the discs near each node."""
+        problem, required = self.problem, point.required
+        assert problem.discs is not None
+        assert required is not None
+        axes, centres = list(problem.discs.position), problem.discs.centres
+        scale = float(np.max(problem.state_scale[axes]))
+        delta = point.states[:, None, axes] - centres
+        distance = np.linalg.norm(delta, axis=-1)
+        near = distance < required + self.reach * scale
+        # Where an end is given nothing can be imposed.
+        near[0] = False
+        if np.all(self._given[axes]):
+            near[-1] = False
+        node, disc = np.nonzero(near)
+        count = node.size
+        normal = unit_vectors(delta[node, disc], distance[node, disc])
+        offset = required[node, disc] + np.sum(normal * centres[disc], axis=-1)
+        one, row = np.ones(count), np.arange(count)
+        size = program.cost_diagonal.size
+        planes = sparse.csc_matrix(
+            (
+                np.concatenate([(normal * problem.state_scale[axes] / scale).T.ravel(), one, -one]),
+                (
+                    np.concatenate([row, row, row, row]),
+                    np.concatenate(
+                        [
+                            self.place.states[node - 1][:, axes].T.ravel(),
+                            size + np.arange(2 * count),
+                        ]
+                    ),
+                ),
+            ),
+            shape=(count, size + 2 * count),
+        )
+        dynamics = program.equality
+        pointers = np.concatenate([dynamics.indptr, np.full(2 * count, dynamics.indptr[-1])])
+        wide = sparse.csc_matrix(
+            (dynamics.data, dynamics.indices, pointers),
+            shape=(len(program.target), planes.shape[1]),
+        )
+        return QuadraticProgram(
+            np.concatenate([program.cost_diagonal, np.zeros(2 * count)]),
+            np.concatenate([program.cost_linear, self.penalty * one, 0.0 * one]),
+            sparse.vstack([wide, planes], format="csc"),
+            np.concatenate([program.target, offset / scale]),
+            np.concatenate([program.low, np.zeros(2 * count)]),
+            np.concatenate([program.high, np.full(2 * count, UNBOUNDED)]),
+        )
