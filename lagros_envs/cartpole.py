@@ -25,11 +25,14 @@ from lagros_envs.conventions import (
 )
 from lagros_envs.disturbances import Disturbance, Situation, channel_mask
 from lagros_envs.dynamics.held import HeldStep
+from lagros_envs.numbers import functions
 from lagros_envs.options import checked_actions, known_options
 from lagros_envs.seeding import SharedStreams, episode_streams
 from lagros_envs.stepwise import StepwiseDisturbance
 
 FloatArray = NDArray[np.float64]
+
+_READY = 64  # starts that are drawn in advance
 
 
 class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -117,21 +120,25 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         )
         self._feedback = self.disturbance.is_feedback
         self._calm = self.disturbance.kind == "none"
+        self._rules = task.StepRules(self.settings)
         self._hold = HeldStep(
             self.settings.system,
             self.settings.control_period,
             compiled,
-            measure=task.StepMeasure(self.settings),
-            given=task.STATE_DIM,
+            measure=self._rules,
+            given=self._rules.GIVEN,
             pushed=not self._calm,
         )
         self._steps = self.settings.steps
-        # r(t) at every control instant.
-        self._radii: list[float] = [self._radius(step) for step in range(self._steps + 1)]
+        # t and r(t) at every control instant.
+        self._clock = [self._instant(step) for step in range(self._steps + 1)]
         # Drawn in advance if the episode has a seed of its own.
         self._pushes: FloatArray | None = None
         self._stepwise = StepwiseDisturbance(self.disturbance, 1, self.settings.control_period)
         self._shared: SharedStreams | None = None
+        # Shares of starts that are drawn in advance, the next one last: to draw many takes little
+        # longer than to draw one.
+        self._ready: list[list[float]] = []
         self.named_space = task.named_space(self.settings)
         self.observation_space = cast(
             "spaces.Space[NDArray[np.float32]]", spaces.flatten_space(self.named_space)
@@ -159,8 +166,8 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
             ValueError: The seed is none, or an option is unknown or has a wrong shape or value.
         """
         options = known_options(options, task.OPTIONS)
-        given = task.start_and_goal(options, (task.STATE_DIM,))
-        nominal = task.nominal_from_options(options, self.settings)
+        given = task.start_and_goal(options, (task.STATE_DIM,)) if options else {}
+        nominal = task.nominal_from_options(options, self.settings) if options else None
         if self.disturbance.kind == "worst" and nominal is None:
             raise ValueError(
                 'disturbance="worst" needs the nominal trajectory of the episode: pass '
@@ -178,16 +185,18 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         self._blank[task.GOAL] = self._scenario.goal
         self._blank[task.INITIAL_STATE] = self._scenario.initial_state
         self._step = 0
-        self._effort = 0.0
-        self._effort_to_success = 0.0
-        self._success_time = math.inf
+        self._now = self._clock[0]
+        distance = task.goal_distance(self._state, self._goal, math.sqrt)
+        inside = distance <= self._now[1]
+        first = 0.0 if inside else math.inf
+        # A `task.Outcome` as a plain tuple, which is several times faster.
+        self._outcome: tuple[Any, ...] = (0.0, 0.0, first, distance, 0.0, False, inside)
         self._push = np.zeros(task.STATE_DIM)
         self._started = True
         self._end = End.NOT_YET
-        arrival = self._note_arrival(self._goal_distance(), fallen=False)
         if self.render_mode == "human":
             self.render()
-        return self._observation(), self._info(arrival, fallen=False)
+        return self._observation(), self._info()
 
     def step(
         self, action: NDArray[np.float32]
@@ -209,20 +218,16 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         if self._end is not End.NOT_YET:
             self._end = warned_after(self._end)
         self._push = self._current_push()
-        integrated, distance, effort, reward = self._advance(force)
-        self._step += 1
-        self._effort += effort
-        fallen = not integrated or abs(self._state[1]) > task.FALL_ANGLE
-        arrival = self._note_arrival(distance, fallen)
-        first_success = arrival[-1]
-        if fallen or first_success:
-            reward = task.reward(self.settings, effort, distance, first_success, fallen)
+        step = self._step = self._step + 1
+        self._now = self._clock[step] if step <= self._steps else self._instant(step)
+        self._advance(force)
+        _, _, _, _, reward, fallen, _ = self._outcome
         if self.render_mode == "human":
             self.render()
-        truncated = self._step >= self._steps
+        truncated = step >= self._steps
         if (fallen or truncated) and self._end is End.NOT_YET:
             self._end = End.REACHED
-        return self._observation(), reward, fallen, truncated, self._info(arrival, fallen)
+        return self._observation(), reward, fallen, truncated, self._info()
 
     @property
     def scenario(self) -> task.CartPoleScenario:
@@ -285,12 +290,15 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
                 )
             return task.sample_scenario(streams.scenario, self.settings)
         if self._shared is None or self._shared.source is not self.np_random:
-            self._shared = SharedStreams(self.np_random)
+            self._shared, self._ready = SharedStreams(self.np_random), []
         if disturbed:
             # Not in advance: an episode of a learner may end after a few steps.
             self._pushes = None
             self._stepwise.begin(np.zeros(1, np.intp), self._shared.disturbance)
-        return task.sample_scenario(self._shared.scenario, self.settings)
+        if not self._ready:
+            drawn = task.draw_shares(self._shared.scenario, (_READY,))
+            self._ready = drawn[::-1].tolist()
+        return task.one_scenario(self._ready.pop(), self.settings)
 
     def _force(self, action: NDArray[np.float32]) -> float:
         if type(action) is np.ndarray and action.shape == (1,) and action.dtype.char in "fd":
@@ -303,40 +311,32 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         force: float = task.applied_force(self.settings, value, _clip)
         return force
 
-    def _advance(self, force: float) -> tuple[bool, float, float, float]:
-        """Move the state over one control step.
-
-        Returns:
-            Whether it could be integrated, ||x - x_f||, ||u||^2 dt, and the reward of a step
-            without a fall or a success.
-        """
+    def _advance(self, force: float) -> None:
+        """Move the state over one control step, whose end `_step` counts already, and judge it."""
         # By name: starred arguments would go through a list and a tuple.
         x0, x1, x2, x3 = self._state
         g0, g1, g2, g3 = self._goal
+        spent, to_success, first, *_ = self._outcome
+        time, radius = self._now
+        given = g0, g1, g2, g3, time, radius, spent, to_success, first
         try:
             if self._calm:
-                results = self._hold.run(x0, x1, x2, x3, force, g0, g1, g2, g3)
+                results = self._hold.run(x0, x1, x2, x3, force, *given)
             else:
                 d0, d1, d2, d3 = self._push.tolist()
-                results = self._hold.run(x0, x1, x2, x3, force, d0, d1, d2, d3, g0, g1, g2, g3)
+                results = self._hold.run(x0, x1, x2, x3, force, d0, d1, d2, d3, *given)
         except (OverflowError, ValueError):  # an infinity has no sine
             pass
         else:
-            p, angle, velocity, rate, distance, effort, reward = results
             # A comparison with nan is false.
-            if distance <= task.LARGEST_DISTANCE:
-                self._state = p, angle, velocity, rate
-                return True, distance, effort, reward
-        effort = force * force * self.settings.control_period
-        return False, self._goal_distance(), effort, 0.0
+            if results[task.STATE_DIM + 3] <= task.LARGEST_DISTANCE:
+                self._state, self._outcome = results[: task.STATE_DIM], results[task.STATE_DIM :]
+                return
+        self._outcome = self._rules.lost(self._state, (force,), given, functions)
 
-    def _goal_distance(self) -> float:
-        distance: float = task.goal_distance(self._state, self._goal, math.sqrt)
-        return distance
-
-    def _radius(self, step: int) -> float:
-        radius: float = self.settings.tube.radius(step * self.settings.control_period)
-        return radius
+    def _instant(self, step: int) -> tuple[float, float]:
+        time = step * self.settings.control_period
+        return time, self.settings.tube.radius(time)
 
     def _current_push(self) -> FloatArray:
         if self._calm:
@@ -358,38 +358,26 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
     def _nominal_index(self) -> int:
         return min(self._step, self._steps)
 
-    def _note_arrival(self, distance: float, fallen: bool) -> tuple[float, float, bool, bool]:
-        """Return ||x - x_f||, r(t), whether x is inside the tube and whether for the first time."""
-        step = self._step
-        radius = self._radii[step] if step <= self._steps else self._radius(step)
-        inside = not fallen and distance <= radius
-        if self._success_time != math.inf:
-            return distance, radius, inside, False
-        self._effort_to_success = self._effort
-        if inside:
-            self._success_time = step * self.settings.control_period
-        return distance, radius, inside, inside
-
     def _observation(self) -> NDArray[np.float32]:
         observation = self._blank.copy()
         # One by one: four floats become an array more slowly than they are stored.
         observation[0], observation[1], observation[2], observation[3] = self._state
-        observation[task.TIME] = self._step * self.settings.control_period
+        observation[task.TIME] = self._now[0]
         return observation
 
-    def _info(self, arrival: tuple[float, float, bool, bool], fallen: bool) -> dict[str, Any]:
-        distance, radius, inside, _ = arrival
-        success = self._success_time != math.inf
+    def _info(self) -> dict[str, Any]:
+        effort, effort_to_success, success_time, distance, _, fallen, inside = self._outcome
+        success = success_time != math.inf
         info = {
             "success": success,
             "is_success": success,
-            "success_time": self._success_time,
+            "success_time": success_time,
             "inside_tube": inside,
             "fallen": fallen,
-            "effort": self._effort,
-            "effort_to_success": self._effort_to_success,
+            "effort": effort,
+            "effort_to_success": effort_to_success,
             "disturbance": self._push,
-            "tube_radius": radius,
+            "tube_radius": self._now[1],
             "goal_distance": distance,
         }
         if self.nominal is not None:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -24,6 +25,7 @@ from lagros_envs.checks import (
     check_positive,
 )
 from lagros_envs.dynamics import CartPole
+from lagros_envs.numbers.functions import where
 from lagros_envs.options import nominal_option, option_numbers
 from lagros_envs.tube import PaperTube
 from lagros_envs.values import ByValue, use_plain_numbers
@@ -128,8 +130,12 @@ class CartPoleScenario(ByValue):
 
 def sample_scenario(rng: np.random.Generator, settings: CartPoleSettings) -> CartPoleScenario:
     """Draw x(0) = [0, theta_0, 0, 0] and x_f = [p_f, 0, 0, 0]."""
-    # What `scenario_of_shares` gives, in a fifth of its time.
-    angle, place = draw_shares(rng).tolist()
+    return one_scenario(draw_shares(rng).tolist(), settings)
+
+
+def one_scenario(shares: Sequence[float], settings: CartPoleSettings) -> CartPoleScenario:
+    """Return what `scenario_of_shares` makes of two shares, in a fifth of its time."""
+    angle, place = shares
     initial_state = np.array([0.0, settings.initial_angle * angle, 0.0, 0.0])
     return CartPoleScenario(initial_state, np.array([settings.goal_range * place, 0.0, 0.0, 0.0]))
 
@@ -241,22 +247,94 @@ def goal_distance(state: Any, goal: Any, sqrt: Any) -> Any:
     return sqrt(p * p + angle * angle + velocity * velocity + rate * rate)
 
 
+class Given(NamedTuple):
+    """What the rules of a step are given, floats or arrays; the last three are theirs to renew.
+
+    Attributes:
+        goal: x_f, its four parts.
+        time: t at the end of the step [s].
+        radius: r(t).
+        effort: The integral of ||u||^2 before the step [N^2 s].
+        effort_to_success: The same, frozen at the first success.
+        success_time: Instant of the first success [s]; inf before.
+    """
+
+    goal: Sequence[Any]
+    time: Any
+    radius: Any
+    effort: Any
+    effort_to_success: Any
+    success_time: Any
+
+
+class Outcome(NamedTuple):
+    """What the rules make of a step, floats or arrays.
+
+    Attributes:
+        effort: As in `Given`, after the step.
+        effort_to_success: As in `Given`, after the step.
+        success_time: As in `Given`, after the step.
+        distance: ||x - x_f||.
+        reward: See `reward`.
+        fallen: Whether the pole has fallen.
+        inside: Whether x is inside the tube, and the pole upright.
+    """
+
+    effort: Any
+    effort_to_success: Any
+    success_time: Any
+    distance: Any
+    reward: Any
+    fallen: Any
+    inside: Any
+
+
 @dataclass(frozen=True)
-class StepMeasure:
-    """What a control step without a fall or a success comes to, from x at its end, u and x_f.
+class StepRules:
+    """The rules at the end of a control step: who has fallen, who has arrived, at what cost.
 
     Attributes:
         settings: The task.
     """
 
+    GIVEN = 9  # numbers in `Given`
+
     settings: CartPoleSettings
 
-    def __call__(self, state: Any, control: Any, goal: Any, functions: Any) -> tuple[Any, Any, Any]:
-        """Return ||x - x_f||, ||u||^2 dt and the reward."""
+    def __call__(
+        self, state: Sequence[Any], control: Sequence[Any], given: Sequence[Any], functions: Any
+    ) -> Outcome:
+        """Judge a step by x at its end, u and the numbers of `Given`."""
+        before = Given(given[:4], *given[4:])
         (force,) = control
-        distance = goal_distance(state, goal, functions.sqrt)
-        effort = force * force * self.settings.control_period
-        return distance, effort, reward(self.settings, effort, distance, False, False)
+        distance = goal_distance(state, before.goal, functions.sqrt)
+        spent = force * force * self.settings.control_period
+        fallen = abs(state[1]) > FALL_ANGLE
+        inside = (distance <= before.radius) & (abs(state[1]) <= FALL_ANGLE)
+        # Before the first success its instant is infinitely late.
+        still_open = before.success_time > before.time
+        first_success = inside & still_open
+        effort = before.effort + spent
+        return Outcome(
+            effort,
+            where(still_open, effort, before.effort_to_success),
+            where(first_success, before.time, before.success_time),
+            distance,
+            reward(self.settings, spent, distance, first_success, fallen),
+            fallen,
+            inside,
+        )
+
+    def lost(
+        self, state: Sequence[Any], control: Sequence[Any], given: Sequence[Any], functions: Any
+    ) -> Outcome:
+        """Judge a step that could not be integrated: a fall, and x stays as it was before."""
+        # Nothing is inside a tube of no radius.
+        judged = self(state, control, [*given[:5], -1.0, *given[6:]], functions)
+        (force,) = control
+        spent = force * force * self.settings.control_period
+        price = reward(self.settings, spent, judged.distance, False, True)
+        return judged._replace(reward=price, fallen=True)
 
 
 def reward(
@@ -280,6 +358,6 @@ def reward(
     stay = period * (0.5 * (reach + abs(reach)))
     return (
         -settings.effort_weight * effort
-        + stay * (1 - fallen)
-        + settings.success_bonus * first_success
+        + where(fallen, 0.0, stay)
+        + where(first_success, settings.success_bonus, 0.0)
     )

@@ -18,6 +18,7 @@ from lagros_envs.dynamics.straight_line import (
     IMPORTS,
     Measure,
     StraightLine,
+    expression,
     recorded_hold,
     recorded_measure,
     statements,
@@ -217,12 +218,7 @@ def _side_by_side(step: StraightLine, abreast: int) -> list[str]:
 
     def assigned(name: str, operation: Operation, side: str) -> str:
         operands = [named(operand, side) for operand in operation.operands]
-        value = (
-            f"{operands[0]} {operation.symbol} {operands[1]}"
-            if len(operands) == 2
-            else f"{operation.symbol}({operands[0]})"
-        )
-        return f"{named(name, side)} = {value}"
+        return f"{named(name, side)} = {expression(operation, operands)}"
 
     loads = [
         f"{named(name, side)} = row{k}[{place}]"

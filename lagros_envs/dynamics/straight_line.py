@@ -32,6 +32,10 @@ _UFUNCS: dict[str, Any] = {
     "exp": np.exp,
     "sqrt": np.sqrt,
     "abs": np.absolute,
+    "<=": np.less_equal,
+    ">": np.greater,
+    "&": np.logical_and,
+    "where": lambda condition, yes, no, out: np.copyto(out, np.where(condition, yes, no)),
 }
 # What the sources that are written here begin with.
 IMPORTS = "from math import cos, exp, sin, sqrt, tan"
@@ -194,17 +198,22 @@ def statements(step: StraightLine) -> tuple[list[str], list[str]]:
     lines: list[str] = []
     texts: dict[str, str] = {}
     for place, (name, operation) in enumerate(step.operations.items()):
-        operands = [texts.get(operand, operand) for operand in operation.operands]
-        text = (
-            f"({operands[0]} {operation.symbol} {operands[1]})"
-            if len(operands) == 2
-            else f"{operation.symbol}({operands[0]})"
-        )
+        text = expression(operation, [texts.get(one, one) for one in operation.operands])
         if counts.get(name, 0) > 1:
             lines.append(f"v{place} = {text}")
             text = f"v{place}"
         texts[name] = text
     return lines, [texts.get(output, output) for output in step.outputs]
+
+
+def expression(operation: Operation, operands: Sequence[str]) -> str:
+    """Return an operation on operands, which are expressions again, as Python writes it."""
+    if operation.symbol == "where":
+        condition, yes, no = operands
+        return f"({yes} if {condition} else {no})"
+    if len(operands) == 2:
+        return f"({operands[0]} {operation.symbol} {operands[1]})"
+    return f"{operation.symbol}({operands[0]})"
 
 
 class ArrayFunction:

@@ -33,6 +33,14 @@ def sqrt(x: Any) -> Any:
     return _of("sqrt", x)
 
 
+def where(condition: Any, yes: Any, no: Any) -> Any:
+    """Return one number where a comparison holds, another elsewhere; for rules, not for physics."""
+    if isinstance(condition, bool):
+        return yes if condition else no
+    own = getattr(condition, "where", None)
+    return np.where(condition, yes, no) if own is None else own(yes, no)
+
+
 def _of(name: str, x: Any) -> Any:
     if isinstance(x, float | int):
         # `math` is ten times faster than NumPy on one number.

@@ -12,7 +12,8 @@ class Operation(NamedTuple):
     """One operation; its result is called `%i` for its place i on the tape.
 
     Attributes:
-        symbol: `+`, `-`, `*`, `/`, `sin`, `cos`, `tan`, `exp`, `sqrt` or `abs`.
+        symbol: `+`, `-`, `*`, `/`, `sin`, `cos`, `tan`, `exp`, `sqrt`, `abs`; or, of rules, `<=`,
+            `>` and `&`, which are 1 where they hold and 0 elsewhere, and `where`.
         operands: Names of inputs, results, or the text of a constant.
     """
 
@@ -109,6 +110,22 @@ class Recorded:
     def __abs__(self) -> Recorded:
         """Record an absolute value."""
         return self.tape.record("abs", self)
+
+    def __le__(self, other: Any) -> Recorded:
+        """Record whether it is at most another."""
+        return self.tape.record("<=", self, other)
+
+    def __gt__(self, other: Any) -> Recorded:
+        """Record whether it is more than another."""
+        return self.tape.record(">", self, other)
+
+    def __and__(self, other: Any) -> Recorded:
+        """Record whether both of two comparisons hold."""
+        return self.tape.record("&", self, other)
+
+    def where(self, yes: Any, no: Any) -> Recorded:
+        """Record the choice between two numbers, by this comparison."""
+        return self.tape.record("where", self, yes, no)
 
     def sin(self) -> Recorded:
         """Record a sine."""

@@ -99,16 +99,26 @@ def test_economised_series_err_less_than_rounding(powers):
         assert abs(sum(found) - sum(exact)) < Fraction(1, 10**16)
 
 
+def moments(count, seed=1):
+    """What the rules of a step are given, in every case that they tell apart."""
+    rng = np.random.default_rng(seed)
+    goals = rng.uniform(-2.0, 2.0, (4, count))
+    time = np.full(count, 0.7)
+    success_time = rng.choice([0.3, math.inf], count)
+    effort = rng.uniform(1.0, 2.0, (2, count))
+    return np.stack([*goals, time, rng.uniform(0.0, 8.0, count), *effort, success_time])
+
+
 @pytest.mark.parametrize("compiled", BACKENDS)
-def test_a_measure_on_floats_is_its_function_bit_for_bit(compiled):
-    settings = task.CartPoleSettings(system=ODD)
-    measure = task.StepMeasure(settings)
-    run = HeldStep(ODD, 0.1, compiled, measure=measure, given=4).run
-    goals = np.random.default_rng(1).uniform(-5.0, 5.0, (40, 4))
-    for state, control, push, goal in zip(*numbers(ODD, 40), goals, strict=True):
+def test_rules_on_floats_are_their_function_bit_for_bit(compiled):
+    rules = task.StepRules(task.CartPoleSettings(system=ODD))
+    run = HeldStep(ODD, 0.1, compiled, measure=rules, given=rules.GIVEN).run
+    for state, control, push, given in zip(*numbers(ODD, 40), moments(40).T, strict=True):
         end = rk4_hold(ODD, state.tolist(), control.tolist(), push.tolist(), 0.1, math)
-        expected = (*end, *measure(end, control.tolist(), goal.tolist(), math))
-        assert run(*state.tolist(), *control.tolist(), *push.tolist(), *goal.tolist()) == expected
+        expected = (*end, *rules(end, control.tolist(), given.tolist(), math))
+        found = run(*state.tolist(), *control.tolist(), *push.tolist(), *given.tolist())
+        assert found == expected
+        assert [type(value) for value in found[-2:]] == [bool, bool]
 
 
 @needs_numba
@@ -123,17 +133,44 @@ def test_blocks_that_are_not_full_change_nothing(worlds):
 
 
 @pytest.mark.parametrize("compiled", BACKENDS)
-def test_what_is_measured_belongs_to_the_state_at_the_end(compiled):
+def test_the_rules_judge_the_state_at_the_end(compiled):
+    """Against the rules written out, world by world."""
     settings = task.CartPoleSettings(system=ODD, effort_weight=0.3, distance_weight=2.0)
-    state, force, push = numbers(ODD, 30)
-    goal = np.random.default_rng(1).uniform(-5.0, 5.0, (30, 4))
-    measure = task.StepMeasure(settings)
-    hold = HeldBatch(ODD, 0.1, (30,), compiled, measure=measure, given=4)
-    end = hold(state.T, force.T, push.T, goal.T).T
-    distance = np.linalg.norm(end - goal, axis=1)
-    effort = 0.1 * force[:, 0] ** 2
-    reward = task.reward(settings, effort, distance, False, False)
-    np.testing.assert_allclose(hold.measured, [distance, effort, reward], rtol=1e-12, atol=1e-11)
+    rules = task.StepRules(settings)
+    state, force, push = numbers(ODD, 300)
+    given = moments(300)
+    hold = HeldBatch(ODD, 0.1, (300,), compiled, measure=rules, given=rules.GIVEN)
+    end = hold(state.T, force.T, push.T, given).T
+    seen = set()
+    for world, x in enumerate(end):
+        goal, (time, radius, effort, frozen, success_time) = given[:4, world], given[4:, world]
+        distance, spent = np.linalg.norm(x - goal), 0.1 * force[world, 0] ** 2
+        fallen = abs(x[1]) > math.pi / 2
+        inside = distance <= radius and not fallen
+        first = inside and math.isinf(success_time)
+        seen.add((fallen, inside, math.isinf(success_time)))
+        reward = task.reward(settings, spent, distance, bool(first), bool(fallen))
+        expected = [
+            effort + spent,
+            effort + spent if math.isinf(success_time) else frozen,
+            time if first else success_time,
+            distance,
+            reward,
+            fallen,
+            inside,
+        ]
+        np.testing.assert_allclose(hold.measured[:, world], expected, rtol=1e-12, atol=1e-11)
+    assert len(seen) == 6
+
+
+@pytest.mark.parametrize("first", [False, True])
+@pytest.mark.parametrize("fallen", [False, True])
+def test_a_reward_is_what_its_page_says(first, fallen):
+    settings = task.CartPoleSettings(upright_bonus=7.0, success_bonus=5.0)
+    expected = -0.01 * 3.0 + 0.1 * (7.0 - 2.0) * (not fallen) + 5.0 * first
+    assert task.reward(settings, 3.0, 2.0, first, fallen) == pytest.approx(expected)
+    arrays = task.reward(settings, 3.0, np.array([2.0]), np.array([first]), np.array([fallen]))
+    assert arrays == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("compiled", BACKENDS)

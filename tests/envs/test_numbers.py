@@ -5,7 +5,7 @@ import math
 import mpmath
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lagros_envs.dynamics.straight_line import ArrayFunction, scalar_source, straight_line
@@ -88,6 +88,34 @@ def test_floats_arrays_and_recorded_numbers_agree_with_50_digits(formula, x, y):
     spelled = {}
     exec(scalar_source(source, 1), spelled)
     assert close(spelled["held"](x, y)[0], wanted)
+
+
+def rules(x, y):
+    low = (x <= y) & (y > 0.5)
+    return [functions.where(low, x, y * y), functions.where(x > y, 1.0, x), low, abs(x) <= abs(y)]
+
+
+@given(numbers, numbers)
+@example(0.5, 0.5)
+@example(math.inf, 1.0)
+@example(math.nan, 1.0)
+def test_rules_are_the_same_on_floats_arrays_and_recorded_numbers(x, y):
+    wanted = [
+        x if x <= y and y > 0.5 else y * y,
+        1.0 if x > y else x,
+        x <= y and y > 0.5,
+        abs(x) <= abs(y),
+    ]
+    np.testing.assert_array_equal(rules(x, y), wanted)
+    arrays = np.array([x, 0.5]), np.array([y, -0.5])
+    np.testing.assert_array_equal([row[0] for row in rules(*arrays)], wanted)
+    step = straight_line(lambda pair: rules(*pair), ["x", "y"])
+    buffers = ArrayFunction(step, (2,))
+    buffers.inputs[:] = arrays
+    np.testing.assert_array_equal(buffers()[:, 0], wanted)
+    spelled = {}
+    exec(scalar_source(straight_line(lambda pair: rules(*pair)[:2], ["x", "y"]), 1), spelled)
+    np.testing.assert_array_equal(spelled["held"](x, y), wanted[:2])
 
 
 @settings(max_examples=25)

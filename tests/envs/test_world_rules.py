@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lagros_envs  # noqa: F401  registers the environment
-from lagros_envs.cartpole_task import CartPoleSettings, StepMeasure
+from lagros_envs.cartpole_task import CartPoleSettings, StepRules
 from lagros_envs.dynamics.held import HeldBatch
 from lagros_envs.scenarios import Scenario
 from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
@@ -60,13 +60,14 @@ def test_a_world_whose_agents_have_all_collided_starts_anew_and_alone():
 
 def test_a_pickled_batch_measures_what_the_original_does():
     settings = CartPoleSettings()
-    batch = HeldBatch(settings.system, 0.1, (3,), False, measure=StepMeasure(settings), given=4)
+    rules = StepRules(settings)
+    batch = HeldBatch(settings.system, 0.1, (3,), False, measure=rules, given=rules.GIVEN)
     rng = np.random.default_rng(0)
-    inputs = rng.normal(size=(4, 3)), rng.normal(size=(1, 3)), np.zeros((4, 3)), np.ones((4, 3))
+    inputs = rng.normal(size=(4, 3)), rng.normal(size=(1, 3)), np.zeros((4, 3)), np.ones((9, 3))
     again = pickle.loads(pickle.dumps(batch))
     np.testing.assert_array_equal(batch(*inputs).copy(), again(*inputs))
     np.testing.assert_array_equal(batch.measured, again.measured)
-    assert batch.measured.shape == (3, 3)
+    assert batch.measured.shape == (7, 3)
 
 
 def test_a_single_agent_takes_its_plan_without_an_axis_of_agents():
