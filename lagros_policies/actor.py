@@ -16,9 +16,16 @@ from numpy.typing import NDArray
 from lagros_envs import cartpole_task as task
 from lagros_envs.checks import check_positive, shown
 from lagros_envs.conventions import settings_of
+from lagros_envs.dynamics.cartpole import ANGLE, POSITION
 from lagros_policies.imitation.networks import Mlp, read_safetensors, write_safetensors
 from lagros_policies.observed import cartpole_rows
-from lagros_policies.trained_for import KEYS, cartpole_range, check_trained_for
+from lagros_policies.trained_for import (
+    KEYS,
+    EpisodeRange,
+    cartpole_range,
+    check_trained_for,
+    range_of,
+)
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -27,6 +34,9 @@ Squash = Literal["clip", "tanh"]
 PRETRAINED = Path(__file__).parent / "pretrained"
 SQUASHES: tuple[Squash, ...] = ("clip", "tanh")
 
+# Where the observation says what its episode asks for.
+_GOAL, _START = task.GOAL.start + POSITION, task.INITIAL_STATE.start + POSITION
+_LEAN = task.INITIAL_STATE.start + ANGLE
 _FORMAT = "lagros-actor-1"
 # Of files that are older than the choice of a squash: their actors clip.
 _CLIPPED_FORMAT = "lagros-ppo-actor-1"
@@ -186,14 +196,13 @@ class ActorPolicy:
         self.settings = settings_of(task.CartPoleSettings(), settings)
         file = PRETRAINED / self.weights_file if weights is None else weights
         self.actor = weights = file if isinstance(file, Actor) else Actor.load(file)
+        what = "the actor" if isinstance(file, Actor) else str(file)
+        assumed = cartpole_range(task.CartPoleSettings(), timed=False)
         check_trained_for(
-            weights.metadata,
-            "the actor" if isinstance(file, Actor) else str(file),
-            self.recorded_as,
-            self.settings,
-            cartpole_range(task.CartPoleSettings(), timed=False),
-            allow_other_settings,
+            weights.metadata, what, self.recorded_as, self.settings, assumed, allow_other_settings
         )
+        trained = range_of(weights.metadata, what, assumed)
+        self._episodes = EpisodeRange.of(self.name, trained, allow_other_settings)
         self._network = weights.network
         self._features = np.ascontiguousarray(weights.features.T)
         self._mean, self._std = weights.mean, weights.std
@@ -216,9 +225,12 @@ class ActorPolicy:
         """Return the mean action and the state as it came; see `Policy.predict`.
 
         Raises:
-            ValueError: The observation is not one of the task, or not finite.
+            ValueError: The observation is not one of the task, not finite, or of an episode with a
+                goal farther away or a start that leans more than in the training.
         """
-        features = cartpole_rows(observation, np.float32) @ self._features
+        rows = cartpole_rows(observation, np.float32)
+        self._episodes.check(rows[..., _GOAL] - rows[..., _START], rows[..., _LEAN])
+        features = rows @ self._features
         features -= self._mean
         features /= self._std
         bound = self._feature_clip

@@ -8,9 +8,13 @@ train.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.checks import check_flag
@@ -128,6 +132,61 @@ def range_of(metadata: Mapping[str, str], what: str, assumed: Range) -> Range:
     if not isinstance(value, dict) or not all(isinstance(part, dict) for part in value.values()):
         raise ValueError(f"{what}: its {SETTINGS!r} must be rules, names and values")
     return value
+
+
+@dataclass(frozen=True)
+class EpisodeRange:
+    """Which episodes a network of the cart-pole may fly: those like the ones of its training.
+
+    Attributes:
+        policy: Whose network it is, for the message.
+        farthest: Largest distance from the start to the goal [m].
+        steepest: Largest angle at the start [rad].
+    """
+
+    policy: str
+    farthest: float = math.inf
+    steepest: float = math.inf
+
+    @classmethod
+    def of(cls, policy: str, trained_for: Range, allow_other_settings: bool) -> EpisodeRange:
+        """Return the range that a record names, or every episode where others are allowed.
+
+        Args:
+            policy: Whose network it is.
+            trained_for: What the network was trained for.
+            allow_other_settings: Whether it may fly all.
+        """
+        if allow_other_settings:
+            return cls(policy)
+        # Of single precision, a hair wider than trained for.
+        farthest, steepest = (
+            (1.0 + 1e-6) * float(trained_for.get("at_most", {}).get(name, math.inf))
+            for name in ("goal_range", "initial_angle")
+        )
+        return cls(policy, farthest, steepest)
+
+    def check(self, ways: NDArray[np.float32], leans: NDArray[np.float32]) -> None:
+        """Check episodes; a single one costs a microsecond.
+
+        Args:
+            ways: p_f - p(0), shape () or (B,) [m].
+            leans: theta(0), of the same shape [rad].
+
+        Raises:
+            ValueError: A goal is farther away, or a start leans more, than in the training.
+        """
+        if ways.ndim == 0:
+            way, lean = abs(ways.item()), abs(leans.item())
+        else:
+            way = float(np.max(np.abs(ways), initial=0.0))
+            lean = float(np.max(np.abs(leans), initial=0.0))
+        if way > self.farthest or lean > self.steepest:
+            raise ValueError(
+                f"the episode goes {way:.3g} m from a lean of {lean:.3g} rad; "
+                f"{self.policy} was trained for at most {self.farthest:.3g} m and "
+                f"{self.steepest:.3g} rad: pass allow_other_settings=True to fly outside of that"
+            )
 
 
 def _needed(trained_for: Range, name: str, value: Any) -> str | None:

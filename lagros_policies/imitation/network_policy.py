@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +14,12 @@ from lagros_policies.imitation.features import FEATURES, cartpole_features
 from lagros_policies.imitation.networks import Mlp
 from lagros_policies.observed import cartpole_rows
 from lagros_policies.policy import PolicyState
-from lagros_policies.trained_for import cartpole_range, check_trained_for, range_of
+from lagros_policies.trained_for import (
+    EpisodeRange,
+    cartpole_range,
+    check_trained_for,
+    range_of,
+)
 
 Float32Array = NDArray[np.float32]
 # Of the features, what an episode asks for.
@@ -70,12 +74,8 @@ class NetworkPolicy:
             assumed,
             allow_other_settings,
         )
-        trained = range_of(self.network.metadata, str(path), assumed).get("at_most", {})
-        # Of single precision, a hair wider than trained for.
-        self._farthest, self._steepest = (
-            math.inf if allow_other_settings else (1.0 + 1e-6) * float(trained.get(name, math.inf))
-            for name in ("goal_range", "initial_angle")
-        )
+        trained = range_of(self.network.metadata, str(path), assumed)
+        self._episodes = EpisodeRange.of(self.name, trained, allow_other_settings)
         self._unit = np.float32(1.0 / self.settings.force_scale)
 
     def predict(
@@ -92,23 +92,9 @@ class NetworkPolicy:
                 goal farther away or a start that leans more than in the training.
         """
         features, side = cartpole_features(cartpole_rows(observation, np.float32))
-        self._check_scenario(features)
+        self._episodes.check(features[..., _WAY], features[..., _LEAN])
         force = self.network(features)
         return force * (side[..., None] * self._unit), state
-
-    def _check_scenario(self, features: Float32Array) -> None:
-        """Check the distance to the goal and the angle at the start of the episode."""
-        if features.ndim == 1:
-            way, lean = abs(features.item(_WAY)), abs(features.item(_LEAN))
-        else:
-            sizes = np.abs(features[:, [_WAY, _LEAN]])
-            way, lean = np.max(sizes, axis=0, initial=0.0).tolist()
-        if way > self._farthest or lean > self._steepest:
-            raise ValueError(
-                f"the episode goes {way:.3g} m from a lean of {lean:.3g} rad; "
-                f"{self.name} was trained for at most {self._farthest:.3g} m and "
-                f"{self._steepest:.3g} rad: pass allow_other_settings=True to fly outside of that"
-            )
 
     def bare_forward(self, features: Float32Array) -> Float32Array:
         """Evaluate the network alone, for timing: features (7,) to force (1,) [N]."""

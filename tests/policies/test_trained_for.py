@@ -235,7 +235,7 @@ def test_every_policy_takes_the_permission():
         assert make(name, env, allow_other_settings=True).name == name
 
 
-@pytest.mark.parametrize("name", ["learned", "lagros", "residual"])
+@pytest.mark.parametrize("name", ["learned", "lagros", "residual", "ppo", "sac", "td3"])
 def test_a_network_flies_no_episode_that_asks_for_more_than_its_training(name):
     env = CartPoleEnv()
     policy = make(name, env)
