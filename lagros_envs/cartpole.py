@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
@@ -33,6 +33,20 @@ from lagros_envs.stepwise import StepwiseDisturbance
 FloatArray = NDArray[np.float64]
 
 _READY = 64  # starts that are drawn in advance
+
+
+class _Start(NamedTuple):
+    """How an episode begins.
+
+    Attributes:
+        state: x(0).
+        goal: x_f.
+        blank: The observation but for state and time, shape (13,), not to be written to.
+    """
+
+    state: tuple[float, ...]
+    goal: tuple[float, ...]
+    blank: NDArray[np.float32]
 
 
 class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -136,9 +150,9 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         self._pushes: FloatArray | None = None
         self._stepwise = StepwiseDisturbance(self.disturbance, 1, self.settings.control_period)
         self._shared: SharedStreams | None = None
-        # Shares of starts that are drawn in advance, the next one last: to draw many takes little
-        # longer than to draw one.
-        self._ready: list[list[float]] = []
+        # Starts that are drawn in advance, the next one last: to draw many takes little longer than
+        # to draw one.
+        self._ready: list[_Start] = []
         self.named_space = task.named_space(self.settings)
         self.observation_space = cast(
             "spaces.Space[NDArray[np.float32]]", spaces.flatten_space(self.named_space)
@@ -175,15 +189,10 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
             )
         seed = plain_seed(seed)
         super().reset(seed=seed)
-        drawn = self._draw(seed)
-        self._scenario = replace(drawn, **given) if given else drawn
+        start = self._draw(seed)
+        self._start = _starts(replace(_scenario(start), **given))[0] if given else start
         self.nominal = nominal
-        self._state: tuple[float, ...] = tuple(self._scenario.initial_state.tolist())
-        self._goal: tuple[float, ...] = tuple(self._scenario.goal.tolist())
-        # What stays the same in every observation of the episode.
-        self._blank = np.zeros(task.OBSERVATION_DIM, np.float32)
-        self._blank[task.GOAL] = self._scenario.goal
-        self._blank[task.INITIAL_STATE] = self._scenario.initial_state
+        self._state, self._goal, self._blank = self._start
         self._step = 0
         self._now = self._clock[0]
         distance = task.goal_distance(self._state, self._goal, math.sqrt)
@@ -233,7 +242,7 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
     def scenario(self) -> task.CartPoleScenario:
         """The scenario of the episode."""
         check_started(self._started, "scenario")
-        return self._scenario
+        return _scenario(self._start)
 
     @property
     def state(self) -> FloatArray:
@@ -279,8 +288,8 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
             self._renderer.close()
             self._renderer = None
 
-    def _draw(self, seed: int | None) -> task.CartPoleScenario:
-        """Draw the disturbance of an episode and return its scenario."""
+    def _draw(self, seed: int | None) -> _Start:
+        """Draw the disturbance of an episode and return its start."""
         disturbed = not self._calm
         if seed is not None:
             streams = episode_streams(seed)
@@ -288,7 +297,7 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
                 self._pushes = self.disturbance.realise(
                     streams.disturbance, self._steps, self.settings.control_period
                 )
-            return task.sample_scenario(streams.scenario, self.settings)
+            return _starts(task.sample_scenario(streams.scenario, self.settings))[0]
         if self._shared is None or self._shared.source is not self.np_random:
             self._shared, self._ready = SharedStreams(self.np_random), []
         if disturbed:
@@ -296,9 +305,9 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
             self._pushes = None
             self._stepwise.begin(np.zeros(1, np.intp), self._shared.disturbance)
         if not self._ready:
-            drawn = task.draw_shares(self._shared.scenario, (_READY,))
-            self._ready = drawn[::-1].tolist()
-        return task.one_scenario(self._ready.pop(), self.settings)
+            shares = task.draw_shares(self._shared.scenario, (_READY,))
+            self._ready = _starts(task.scenario_of_shares(shares, self.settings))[::-1]
+        return self._ready.pop()
 
     def _force(self, action: NDArray[np.float32]) -> float:
         if type(action) is np.ndarray and action.shape == (1,) and action.dtype.char in "fd":
@@ -316,22 +325,25 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
         # By name: starred arguments would go through a list and a tuple.
         x0, x1, x2, x3 = self._state
         g0, g1, g2, g3 = self._goal
-        spent, to_success, first, *_ = self._outcome
-        time, radius = self._now
-        given = g0, g1, g2, g3, time, radius, spent, to_success, first
+        spent, frozen, first, _, _, _, _ = self._outcome
+        t, r = self._now
+        run = self._hold.run
         try:
             if self._calm:
-                results = self._hold.run(x0, x1, x2, x3, force, *given)
+                results = run(x0, x1, x2, x3, force, g0, g1, g2, g3, t, r, spent, frozen, first)
             else:
-                d0, d1, d2, d3 = self._push.tolist()
-                results = self._hold.run(x0, x1, x2, x3, force, d0, d1, d2, d3, *given)
+                push = self._push.tolist()
+                results = run(
+                    x0, x1, x2, x3, force, *push, g0, g1, g2, g3, t, r, spent, frozen, first
+                )
         except (OverflowError, ValueError):  # an infinity has no sine
             pass
         else:
-            # A comparison with nan is false.
-            if results[task.STATE_DIM + 3] <= task.LARGEST_DISTANCE:
-                self._state, self._outcome = results[: task.STATE_DIM], results[task.STATE_DIM :]
+            # The distance; a comparison with nan is false.
+            if results[7] <= task.LARGEST_DISTANCE:
+                self._state, self._outcome = results[:4], results[4:]
                 return
+        given = (*self._goal, t, r, spent, frozen, first)
         self._outcome = self._rules.lost(self._state, (force,), given, functions)
 
     def _instant(self, step: int) -> tuple[float, float]:
@@ -384,6 +396,19 @@ class CartPoleEnv(Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]])
             nominal = self.nominal[self._nominal_index()].tolist()
             info["tracking_error"] = task.goal_distance(self._state, nominal, math.sqrt)
         return info
+
+
+def _starts(scenarios: task.CartPoleScenario) -> list[_Start]:
+    """Return the starts of one scenario or of several."""
+    states, goals = np.atleast_2d(scenarios.initial_state, scenarios.goal)
+    blanks = np.zeros((len(states), task.OBSERVATION_DIM), np.float32)
+    blanks[:, task.GOAL], blanks[:, task.INITIAL_STATE] = goals, states
+    pairs = zip(map(tuple, states.tolist()), map(tuple, goals.tolist()), blanks, strict=True)
+    return [_Start(*one) for one in pairs]
+
+
+def _scenario(start: _Start) -> task.CartPoleScenario:
+    return task.CartPoleScenario(np.array(start.state), np.array(start.goal))
 
 
 def _clip(value: float, low: float, high: float) -> float:

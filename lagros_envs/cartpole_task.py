@@ -130,12 +130,8 @@ class CartPoleScenario(ByValue):
 
 def sample_scenario(rng: np.random.Generator, settings: CartPoleSettings) -> CartPoleScenario:
     """Draw x(0) = [0, theta_0, 0, 0] and x_f = [p_f, 0, 0, 0]."""
-    return one_scenario(draw_shares(rng).tolist(), settings)
-
-
-def one_scenario(shares: Sequence[float], settings: CartPoleSettings) -> CartPoleScenario:
-    """Return what `scenario_of_shares` makes of two shares, in a fifth of its time."""
-    angle, place = shares
+    # What `scenario_of_shares` gives, in a fifth of its time.
+    angle, place = draw_shares(rng).tolist()
     initial_state = np.array([0.0, settings.initial_angle * angle, 0.0, 0.0])
     return CartPoleScenario(initial_state, np.array([settings.goal_range * place, 0.0, 0.0, 0.0]))
 
