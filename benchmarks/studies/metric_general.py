@@ -102,7 +102,7 @@ def car() -> tuple[System, BoxRegion, CvStemSettings]:
     )
     # A turned plan has a turned metric: of second degree in the sine and cosine of its heading.
     basis = products(harmonics(2, 2), powers(3, 2))
-    settings = CvStemSettings(0.5, 0, 0.05, 0.05, (1.0,) * 4, basis, "nominal")
+    settings = CvStemSettings(0.5, 0, 0.05, 0.1, (1.0,) * 4, basis, "nominal")
     return Car(), region, settings
 
 
@@ -119,7 +119,7 @@ def pvtol() -> tuple[System, BoxRegion, CvStemSettings]:
     )
     basis = Basis(("1", "cos(x[2])", "sin(x[2])", "x[3]"))
     scaling = (1.0, 1.0, 3.0, 1.0, 1.0, 1.0)
-    return body, region, CvStemSettings(0.5, 0, 0.05, 0.05, scaling, basis)
+    return body, region, CvStemSettings(0.5, 0, 0.05, 0.1, scaling, basis)
 
 
 CASES = {"car": car, "pvtol": pvtol}

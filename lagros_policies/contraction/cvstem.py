@@ -54,7 +54,7 @@ _BOUND_ROUNDS = 20
 _NEAR = 0.1
 # How many of the worst are added, wherever they are.
 _WORST = 8
-# How many more searches of a region must find nothing before a metric is taken.
+# How many searches of a region must find nothing, where its pool is satisfied.
 _SEEDS = 5
 
 
@@ -292,12 +292,10 @@ def _residual(
     """Return the pool, with what searches of the region found, and by how much the metric fails."""
     if not effort.first:
         return pool, np.full(1, -math.inf)
-    if effort.searched:
-        pool = joined(pool, search_violation(system, metric, turn)[0])
     residual = contraction_residual(system, metric, pool)
     if effort.searched and residual.max() <= 0.0:
-        others = range(_SEEDS * turn + effort.rounds, _SEEDS * (turn + 1) + effort.rounds)
-        pool = joined(pool, *(search_violation(system, metric, seed)[0] for seed in others))
+        seeds = range(_SEEDS * turn, _SEEDS * (turn + 1))
+        pool = joined(pool, *(search_violation(system, metric, seed)[0] for seed in seeds))
         residual = contraction_residual(system, metric, pool)
     return pool, residual
 

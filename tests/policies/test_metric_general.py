@@ -55,6 +55,7 @@ PVTOL_BOX = BoxRegion(
     (2.0, 2.0),
     (3.0, 3.0),
 )
+TWO = products(powers(0, 1), powers(1, 1))
 TRIPLE_BOX = BoxRegion((-1.0,) * 4, (1.0,) * 4, (0.4,) * 4, (-1.0,) * 3, (1.0,) * 3)
 
 
@@ -191,24 +192,38 @@ def stated_in_cvxpy(system, samples, places, settings):
 
 
 @pytest.mark.parametrize(
-    ("system", "box", "basis", "point", "scaling"),
+    ("system", "box", "basis", "point", "rate", "scaling"),
     [
-        pytest.param(Car(), CAR_BOX, harmonics(2, 1), "nominal", (1, 1, 2, 1), id="car, of x_d"),
-        pytest.param(Pvtol(), PVTOL_BOX, cosines(2, 1), "state", (1, 1, 2, 1, 1, 1), id="pvtol"),
-        pytest.param(Triple(), TRIPLE_BOX, powers(3, 1), "state", (1, 1, 1, 1.5), id="triple"),
-        pytest.param(Triple(), TRIPLE_BOX, powers(0, 0), "state", (1, 1, 1, 1), id="constant"),
+        pytest.param(
+            *(Car(), CAR_BOX, harmonics(2, 1), "nominal", 0.3, (1.0, 1.0, 2.0, 1.0)), id="car"
+        ),
+        pytest.param(
+            *(Pvtol(), PVTOL_BOX, cosines(2, 1), "state", 0.3, (1.0, 1.0, 2.0, 1.0, 1.0, 1.0)),
+            id="pvtol",
+        ),
+        pytest.param(
+            *(Triple(), TRIPLE_BOX, powers(3, 1), "state", 3.0, (1.0, 1.0, 1.0, 1.5)), id="triple"
+        ),
+        pytest.param(
+            *(Triple(), TRIPLE_BOX, harmonics(3, 1), "nominal", 3.0, (1.0,) * 4), id="of x_d"
+        ),
+        pytest.param(*(Triple(), TRIPLE_BOX, TWO, "nominal", 3.0, (1.0,) * 4), id="of two"),
+        pytest.param(
+            *(Triple(), TRIPLE_BOX, powers(0, 0), "state", 3.0, (1.0,) * 4), id="constant"
+        ),
     ],
 )
-def test_a_design_is_the_optimum_of_the_program_stated_in_cvxpy(system, box, basis, point, scaling):
-    scaling = tuple(map(float, scaling))
-    settings = CvStemSettings(0.3, 0, 0.1, 0.05, scaling, basis, point)
+def test_a_design_is_the_optimum_of_the_program_stated_in_cvxpy(
+    system, box, basis, point, rate, scaling
+):
+    settings = CvStemSettings(rate, 0, 0.1, 0.05, scaling, basis, point)
     samples = box.sample(np.random.default_rng(5), 12)
     metric = design_metric(system, samples, box, settings)
-    # The bounds on a grid of the one coordinate that the functions depend on.
-    places = np.zeros((25, system.state_dim))
-    for coordinate in basis.coordinates:
-        ends = box.low[coordinate], box.high[coordinate]
-        places[:, coordinate] = np.linspace(*ends, 25)
+    # The bounds on a grid of the coordinates that the functions depend on.
+    ends = [np.linspace(box.low[one], box.high[one], 7) for one in basis.coordinates]
+    grid = np.stack(np.meshgrid(*ends), axis=-1).reshape(-1, len(ends)) if ends else [[]]
+    places = np.zeros((len(grid), system.state_dim))
+    places[:, basis.coordinates] = grid
     chi, nu = stated_in_cvxpy(system, samples, places, settings)
     cost = metric.condition_bound + 0.1 * metric.control_weight
     assert cost == pytest.approx(chi + 0.1 * nu, rel=2e-2 if basis.degree else 1e-3)
@@ -222,18 +237,20 @@ def test_a_design_is_the_optimum_of_the_program_stated_in_cvxpy(system, box, bas
 
 
 def test_a_design_on_a_region_holds_all_over_it():
-    box = replace(CAR_BOX, low=(-1.0, -1.0, -0.5, 1.0), high=(1.0, 1.0, 0.5, 1.5))
-    basis = products(harmonics(2, 1), powers(3, 1))
-    settings = CvStemSettings(0.3, 0, 0.05, 0.05, (1.0,) * 4, basis, "nominal")
-    metric = design_on_region(Car(), box, settings, pool=2000, first=40)
-    fresh = box.sample(np.random.default_rng(99), 3000)
-    assert brute_residual(Car(), metric, fresh.take(np.arange(100))).max() < 0.0
-    checked = verify_metric(Car(), metric, fresh, 99).verification
+    settings = CvStemSettings(1.8, 0, 0.05, 0.1, (1.0,) * 4, harmonics(3, 1), "nominal")
+
+    def design(**effort):
+        return design_on_region(Triple(), TRIPLE_BOX, settings, pool=40, first=20, **effort)
+
+    metric = design()
+    fresh = TRIPLE_BOX.sample(np.random.default_rng(99), 3000)
+    assert brute_residual(Triple(), metric, fresh.take(np.arange(100))).max() < 0.0
+    checked = verify_metric(Triple(), metric, fresh, 99).verification
     assert checked.violations == 0
     assert checked.worst < 0.0
-    assert search_violation(Car(), metric, 99)[1] < 0.0
+    assert search_violation(Triple(), metric, 0)[1] < 0.0
     with pytest.raises(RuntimeError, match="after 1 programs"):
-        design_on_region(Car(), box, settings, pool=2000, first=40, rounds=1)
+        design(rounds=1)
 
 
 # The control laws.
@@ -319,7 +336,15 @@ def test_noise_moves_no_metric_of_the_plan_and_others_are_refused():
         ({"basis": products(harmonics(2, 1), powers(4, 1))}, r"x\[4\] is none of the 4 states"),
         ({"point": "plan"}, "point"),
         ({"region": PVTOL_BOX}, "of 6 states, and the metric is of 4"),
-        ({"region": replace(CAR_BOX, high=(2.0, 2.0, 1.0, 900.0))}, r"not positive .* x\[3\]="),
+        # 1 - x[3] / 2 is below zero from 2 on, which the region hardly reaches.
+        (
+            {
+                "basis": powers(3, 1),
+                "coefficients": np.stack([np.eye(4), -0.5 * np.eye(4)]),
+                "region": replace(CAR_BOX, high=(2.0, 2.0, 1.0, 2.1)),
+            },
+            r"not positive .* x\[3\]=2\.",
+        ),
         ({"scaling": np.ones(3)}, "scaling"),
     ],
 )
