@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import check_whole
 from lagros_envs.dynamics import System
 from lagros_policies.contraction.basis import Basis
 from lagros_policies.contraction.condition import Samples, contraction_residual, search_violation
@@ -112,7 +113,9 @@ def design_on_pool(
     Raises:
         InfeasibleError: No metric exists for this alpha, region and basis.
         RuntimeError: The pool was not satisfied within the rounds.
+        ValueError: A number is not positive, or as for `design_metric`.
     """
+    _check_numbers(first=first, rounds=rounds)
     active = np.arange(min(first, len(pool.state)))
     return _design(system, pool, active, region, settings, _Effort(first, rounds))
 
@@ -144,7 +147,9 @@ def design_on_region(
     Raises:
         InfeasibleError: No metric exists for this alpha, region and basis.
         RuntimeError: Condition and bounds were not met within the rounds.
+        ValueError: A number is not positive, or as for `design_metric`.
     """
+    _check_numbers(pool=pool, first=first, rounds=rounds)
     drawn = region.sample(np.random.default_rng(seed), pool)
     active, effort = np.arange(min(first, pool)), _Effort(first, rounds, searched=True)
     return _design(system, drawn, active, region, settings, effort)
@@ -257,6 +262,11 @@ def _design(
         f"{after} the condition still fails by {worst:.2e} 1/s on the pool: raise the margin, "
         "which closes the gaps between samples"
     )
+
+
+def _check_numbers(**numbers: int) -> None:
+    for name, value in numbers.items():
+        check_whole(name, value)
 
 
 def _bounds(

@@ -453,6 +453,13 @@ def test_a_region_of_one_s_own_flies_and_is_not_written(tmp_path):
     assert not (tmp_path / "metric.json").exists()
 
 
+@pytest.mark.parametrize("number", ["pool", "first", "rounds"])
+def test_numbers_of_a_design_are_positive(number):
+    settings = CvStemSettings(0.3, 0, scaling=(1.0,) * 4)
+    with pytest.raises(ValueError, match=f"{number}=0 must be a whole number >= 1"):
+        design_on_region(Triple(), TRIPLE_BOX, settings, **{number: 0})
+
+
 def test_a_design_without_a_basis_is_of_the_cartpole():
     settings = CvStemSettings(0.3, 2, scaling=(1.0,) * 6)
     samples = PVTOL_BOX.sample(np.random.default_rng(0), 5)
