@@ -1,6 +1,6 @@
 """The planner's quadratic program written in CVXPY, to read and to change.
 
-`lagros_policies.planning` assembles the same program by hand, a hundred times as fast. Here it can
+`lagros_policies.planning` assembles the same program by hand, forty times as fast. Here it can
 be read line by line and be given another cost or constraint; the loop around it plans a car among
 discs. Needs `pip install 'lagros[train]'`.
 

@@ -3,7 +3,7 @@
 Every plan is checked by equations and an integrator of its own on a grid ten times as fine as the
 nodes: distances from the discs between the nodes, bounds, ends and defects.
 
-    OMP_NUM_THREADS=1 python benchmarks/studies/planner_general.py [--episodes 500]
+    OMP_NUM_THREADS=1 python benchmarks/studies/planner_general.py [--episodes 500] [--others 10]
         [--json benchmarks/results/planner_general.json]
 """
 
@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from studies.planar import GRAVITY, car_problem, pvtol_problem
 
 from lagros_envs.files import write_atomic
 from lagros_policies.planning import PlannerSettings, Problem, Trajectory, plan_trajectory
+from lagros_policies.planning.qp import QpSolver
 
 FloatArray = NDArray[np.float64]
 Rates = Callable[[FloatArray, FloatArray], FloatArray]
@@ -192,19 +193,19 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--episodes", type=int, default=500)
-    parser.add_argument("--solvers", default="piqp", help="comma separated: piqp,clarabel,osqp")
+    parser.add_argument(
+        "--others", type=int, default=10, help="episodes by Clarabel and by OSQP; 0 for none"
+    )
     parser.add_argument("--cases", default="", help="only those whose names hold this")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     rows = []
-    for solver in arguments.solvers.split(","):
-        plain = PlannerSettings()
-        settings = replace(plain, scp=replace(plain.scp, qp_solver=solver))
-        rows += [
-            measure(case, arguments.episodes, settings)
-            for case in CASES
-            if arguments.cases in case.name
-        ]
+    usual = PlannerSettings()
+    for solver in get_args(QpSolver):
+        episodes = arguments.episodes if solver == usual.scp.qp_solver else arguments.others
+        settings = replace(usual, scp=replace(usual.scp, qp_solver=solver))
+        cases = [case for case in CASES if arguments.cases in case.name] if episodes > 0 else []
+        rows += [measure(case, episodes, settings) for case in cases]
     show(rows)
     if arguments.json is not None:
         write_atomic(arguments.json, json.dumps(rows, indent=1) + "\n")

@@ -8,7 +8,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lagros_envs.checks import MOST_STEPS, check_not_negative, check_positive, check_whole, shown
+from lagros_envs.checks import (
+    MOST_STEPS,
+    check_fields,
+    check_not_negative,
+    check_positive,
+    check_whole,
+    shown,
+)
 from lagros_envs.dynamics import System
 from lagros_policies.contraction.tube import tighten
 
@@ -58,10 +65,9 @@ class Discs:
             value = getattr(self, name)
             if not np.all(np.isfinite(value)) or (name != "centres" and np.any(value < 0.0)):
                 raise ValueError(f"{name}={shown(value)} must be finite and >= 0")
+        check_fields(self)
         first, second = self.position
-        check_whole("position", first, 0)
-        check_whole("position", second, 0)
-        if first == second:
+        if first == second or min(first, second) < 0:
             raise ValueError(f"position={self.position!r} must be two different coordinates")
 
     def required(self, steps: int) -> FloatArray:
@@ -169,6 +175,8 @@ class Problem:
         around = self.discs
         if around is not None:
             more = _shaped("discs", discs, (self.steps + 1,))
+            if not np.all(more >= 0.0):
+                raise ValueError(f"discs={shown(discs)} must be >= 0, the radius of a tube")
             around = replace(around, margin=around.margin + more)
         return replace(
             self,

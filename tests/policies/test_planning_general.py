@@ -237,22 +237,21 @@ def test_with_scales_units_do_not_matter():
     )
     assert plain.solved
     assert scaled.solved
-    assert scaled.states * unit == pytest.approx(plain.states, abs=5e-3)
-    assert scaled.effort * 1e-4 == pytest.approx(plain.effort, rel=1e-2)
+    assert scaled.states * unit == pytest.approx(plain.states, abs=5e-2)
+    assert scaled.effort * 1e-4 == pytest.approx(plain.effort, rel=2e-2)
 
 
 def test_the_iteration_may_stop_where_effort_hardly_falls():
-    problem = pvtol_problem(np.random.default_rng([7, 1]))
     usual = PlannerSettings().scp
-    early = solve_scp(problem, next(guesses(problem)), usual)
-    late = solve_scp(
-        problem,
-        next(guesses(problem)),
-        replace(usual, effort_tolerance=1e-5, max_iterations=300),
-    )
-    assert early.solved
-    assert early.iterations < late.iterations
-    assert early.effort < 1.05 * late.effort
+    longer = replace(usual, effort_tolerance=1e-5, max_iterations=300)
+    early, late = [], []
+    for episode in range(4):
+        problem = pvtol_problem(np.random.default_rng([7, episode]))
+        early.append(solve_scp(problem, next(guesses(problem)), usual))
+        late.append(solve_scp(problem, next(guesses(problem)), longer))
+    assert all(plan.solved for plan in early)
+    assert sum(plan.iterations for plan in early) < 0.8 * sum(plan.iterations for plan in late)
+    assert sum(plan.effort for plan in early) < 1.1 * sum(plan.effort for plan in late)
 
 
 def test_a_step_is_shortened_only_where_the_trust_region_is_tight(monkeypatch):
@@ -299,6 +298,32 @@ def test_no_plan_passes_through_a_disc_between_two_nodes(steps, period):
     assert keep_distance(problem, exact_places(plan)) >= -1e-4
     # It comes near: room is not given away but to what the coarse grid needs.
     assert keep_distance(problem, exact_places(plan)) < 0.02
+
+
+def test_guesses_go_around_a_disc_on_either_side():
+    discs = Discs(np.array([[1.0, 0.0]]), np.array(0.3), body_radius=0.1)
+    problem = cart(discs=discs)
+    first, second, roomy, straight = (states for states, _ in guesses(problem))
+    middle = [states[10, 1] for states in (first, second)]
+    assert middle[0] == pytest.approx(-middle[1], abs=1e-9)
+    assert abs(middle[0]) > 0.3
+    assert abs(roomy[10, 1]) > abs(middle[0])
+    assert straight == pytest.approx(np.linspace(problem.initial_state, problem.terminal_state, 21))
+    # From rest to rest: slow at both ends.
+    steps = np.linalg.norm(np.diff(first[:, :2], axis=0), axis=1)
+    assert max(steps[0], steps[-1]) < 0.3 * steps[10]
+    moving = replace(problem, initial_state=np.array([0.0, 0.0, 1.0, 0.0]))
+    states, controls = next(guesses(moving))
+    assert np.linalg.norm(states[1, :2]) > 2.0 * steps[0]
+    assert np.all(controls == 0.0)
+
+
+def test_without_a_disc_or_a_place_to_end_at_the_guess_is_straight():
+    discs = Discs(np.array([[1.0, 0.0]]), np.array(0.3))
+    anywhere = np.array([2.0, np.nan, 0.0, 0.0])
+    for problem in (cart(), replace(cart(discs=discs), terminal_state=anywhere)):
+        (straight,) = (states for states, _ in guesses(problem))
+        assert straight[:, 1] == pytest.approx(np.zeros(21))
 
 
 def test_what_the_check_between_nodes_is_for(monkeypatch):
@@ -381,6 +406,13 @@ def test_a_tube_that_leaves_nothing_is_refused():
         problem.tightened(states=np.array(-0.1))
     with pytest.raises(ValueError, match="states of shape"):
         problem.tightened(states=np.zeros(3))
+    around = replace(
+        problem, discs=Discs(np.array([[1.0, 0.0]]), np.array(0.3), margin=np.array(0.1))
+    )
+    with pytest.raises(ValueError, match=r"discs=-0\.5"):
+        around.tightened(discs=-0.5)
+    with pytest.raises(ValueError, match="initial_state is 1 from the centre"):
+        around.tightened(discs=0.7)
 
 
 # Solvers.
@@ -393,8 +425,9 @@ def test_every_solver_makes_the_same_plan(solver):
     named = replace(settings, scp=replace(settings.scp, qp_solver=solver))
     first, second = plan_trajectory(problem), plan_trajectory(problem, named)
     assert second.solved
-    assert second.states == pytest.approx(first.states, abs=1e-3)
-    assert second.effort == pytest.approx(first.effort, rel=1e-3)
+    # To what a last step below the tolerance leaves open.
+    assert second.states == pytest.approx(first.states, abs=1e-2)
+    assert second.effort == pytest.approx(first.effort, rel=1e-2)
 
 
 @pytest.fixture
@@ -478,6 +511,8 @@ def test_problems_that_make_no_sense_are_refused(given, message):
         ({"margin": np.array(INF)}, "margin"),
         ({"position": (1, 1)}, "position"),
         ({"position": (0, -1)}, "position"),
+        ({"position": (0,)}, "position"),
+        ({"position": (0.0, 1.0)}, "position"),
     ],
 )
 def test_discs_that_make_no_sense_are_refused(given, message):
