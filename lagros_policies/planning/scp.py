@@ -43,7 +43,7 @@ class ScpSettings:
         max_iterations: Quadratic programs at most.
         defect_tolerance: Largest violation of the true dynamics of an accepted plan.
         effort_tolerance: Once a pass lowers the merit by less than this share of it, the trust
-            region closes until the step is below its tolerance; zero for never.
+            region closes until the plan obeys the dynamics, whatever its step; zero for never.
         step_tolerance: Stop when no state (and no control, times the period) moves by more, in
             scales.
         qp_tolerance: Residual of the quadratic programs.
@@ -185,9 +185,10 @@ class _Iteration:
             elif not (refused and settings.keep_weight):
                 weight = max(weight / 8.0, settings.trust_weight)
             refused = False
+            # Once the effort hardly falls it does not matter how far the last step went.
+            at_rest = closing or (share == 1.0 and step <= settings.step_tolerance)
             if (
-                share == 1.0
-                and step <= settings.step_tolerance
+                at_rest
                 and point.defect <= settings.defect_tolerance
                 and point.clearance >= -DISTANCE_SLACK
             ):
