@@ -55,7 +55,7 @@ _BOUND_ROUNDS = 20
 _NEAR = 0.1
 # How many of the worst are added, wherever they are.
 _WORST = 8
-# How many searches of a region must find nothing, where its pool is satisfied.
+# How many searches of a region must find nothing, once its pool is satisfied; before, there is one.
 _SEEDS = 5
 
 
@@ -303,10 +303,12 @@ def _residual(
     if not effort.first:
         return pool, np.full(1, -math.inf)
     residual = contraction_residual(system, metric, pool)
-    if effort.searched and residual.max() <= 0.0:
-        seeds = range(_SEEDS * turn, _SEEDS * (turn + 1))
-        pool = joined(pool, *(search_violation(system, metric, seed)[0] for seed in seeds))
-        residual = contraction_residual(system, metric, pool)
+    if effort.searched:
+        count = _SEEDS if residual.max() <= 0.0 else 1
+        seeds = range(_SEEDS * turn, _SEEDS * turn + count)
+        found = joined(*(search_violation(system, metric, seed)[0] for seed in seeds))
+        pool = joined(pool, found)
+        residual = np.concatenate([residual, contraction_residual(system, metric, found)])
     return pool, residual
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.checks import shown
 from lagros_envs.dynamics import CartPole, System
 from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_envs.dynamics.spacecraft import Spacecraft
@@ -59,7 +60,7 @@ def check_cartpole_metric(metric: Any, what: str) -> None:
     angle = metric.point == "state" and metric.phi == cosines(ANGLE, len(metric.coefficients) - 1)
     if not angle or not isinstance(metric.region, Region):
         raise ValueError(
-            f"the metric is of {', '.join(metric.phi.terms)} at the {metric.point}, on a "
+            f"the metric is of {shown(metric.phi.terms)} at the {metric.point}, on a "
             f"{type(metric.region).__name__}: {what} is for 1, cos(x[{ANGLE}]), ... at the state, "
             "on a Region"
         )
