@@ -101,7 +101,7 @@ def car() -> tuple[System, BoxRegion, CvStemSettings]:
         control_high=(2.0, 1.0),
     )
     # A turned plan has a turned metric: of second degree in the sine and cosine of its heading.
-    basis = products(harmonics(2, 2), powers(3, 2))
+    basis = products(harmonics(2, 2), powers(3, 1))
     settings = CvStemSettings(0.5, 0, 0.05, 0.1, (1.0,) * 4, basis, "nominal")
     return Car(), region, settings
 

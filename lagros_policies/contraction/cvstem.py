@@ -49,6 +49,8 @@ _BOUND_STATES = 40
 # By how much the bounds may be exceeded before they are imposed there too, and the least eigenvalue
 # with which W_bar is looked at further.
 _BOUND_SLACK = 0.01
+# A bound further from binding than this leaves the program of a region.
+_BOUND_NEAR = 0.1
 _LEAST = 0.1
 _BOUND_ROUNDS = 20
 # How near to binding a sample stays in the program of a region [1/s].
@@ -239,8 +241,8 @@ def _design(
     for turn in range(effort.rounds):
         conditions = condition_rows(system, pool.take(active), settings)
         scaled, weight, bound = solve_program(conditions, places, region, settings)
-        least, largest, outside = _bounds(scaled, bound, *where)
-        places = np.concatenate([places, outside])
+        least, largest, outside, near = _bounds(scaled, bound, places, *where)
+        places = np.concatenate([places[near], outside])
         if len(outside) and least <= _LEAST:
             continue
         metric = _scaled_metric(scaled, weight, (least, largest), region, settings)
@@ -270,9 +272,19 @@ def _check_numbers(**numbers: int) -> None:
 
 
 def _bounds(
-    scaled: FloatArray, bound: float, region: MetricRegion, phi: Basis, point: Point, n: int
-) -> tuple[float, float, FloatArray]:
-    """Return the extreme eigenvalues of the scaled W_bar, and places to bound it at as well.
+    scaled: FloatArray,
+    bound: float,
+    places: FloatArray,
+    region: MetricRegion,
+    phi: Basis,
+    point: Point,
+    n: int,
+) -> tuple[float, float, FloatArray, NDArray[np.bool_]]:
+    """Return the extreme eigenvalues of the scaled W_bar, and where to bound it next.
+
+    Returns:
+        The least and the largest; places to bound it at as well; and which of the present ones are
+        near to binding, without which the program has another optimum.
 
     Raises:
         RuntimeError: It is not positive between the angles of a grid, which no place is added to.
@@ -293,7 +305,11 @@ def _bounds(
             "degree or scaling"
         )
     kept = least >= 1.0 - _BOUND_SLACK and largest <= bound * (1.0 + _BOUND_SLACK)
-    return least, largest, ends[:0] if grid or kept else ends
+    if grid or kept:
+        return least, largest, ends[:0], np.ones(len(places), np.bool_)
+    present = np.linalg.eigvalsh(dual(places))
+    near = (present[:, 0] <= 1.0 + _BOUND_NEAR) | (present[:, -1] >= bound * (1.0 - _BOUND_NEAR))
+    return least, largest, ends, near
 
 
 def _residual(
