@@ -233,8 +233,9 @@ def check_name(name: str, value: str, valid: Iterable[str]) -> None:
         ValueError: It is none of them.
     """
     names = list(valid)
-    known = isinstance(value, str) and value in names
-    _check(known, name, value, f"one of {', '.join(names)}.{suggestion(value, names)}")
+    # A suggestion takes long to find: not for a name that is known.
+    if not (isinstance(value, str) and value in names):
+        _check(False, name, value, f"one of {', '.join(names)}.{suggestion(value, names)}")
 
 
 def suggestion(given: Any, names: Iterable[str]) -> str:
