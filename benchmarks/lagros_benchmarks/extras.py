@@ -12,7 +12,7 @@ from importlib.util import find_spec
 MODULES = {
     "policies": ("clarabel", "piqp", "safetensors", "scipy"),
     "bench": ("PIL", "joblib", "matplotlib", "rich", "typer"),
-    "train": ("cvxpy", "joblib", "torch"),
+    "train": ("cvxpy", "joblib", "osqp", "torch"),
     "rl": ("stable_baselines3", "tensorboard"),
     "render": ("pygame",),
     "video": ("imageio_ffmpeg",),

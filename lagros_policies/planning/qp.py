@@ -170,7 +170,9 @@ def osqp_solver(
     try:
         import osqp
     except ImportError as error:
-        raise ImportError("the solver 'osqp' is not installed: pip install osqp") from error
+        raise ImportError(
+            "the solver 'osqp' is not installed: pip install 'lagros[train]'"
+        ) from error
     solver = osqp.OSQP()
     solver.setup(
         _diagonal(program),

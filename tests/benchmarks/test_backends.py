@@ -250,8 +250,10 @@ def test_who_stops_asking_leaves_no_chunk_running(how, tmp_path):
 
 @pytest.mark.parametrize("kill", [signal.SIGINT, signal.SIGKILL])
 def test_workers_end_with_the_one_that_asked(kill, tmp_path):
+    # What a shell starts in the background ignores Ctrl-C, and so does what that starts.
     script = f"""
-import pathlib
+import pathlib, signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from lagros_policies.backends import each
 from tests.benchmarks.fragile import Fragile
 work = Fragile(pathlib.Path({str(tmp_path)!r}), lasting=600.0)
@@ -265,10 +267,13 @@ list(each(work, range(100), 2))
         start_new_session=True,
     )
     log = fragile.Fragile(tmp_path).log
-    wait_until(lambda: len(log()) >= 2)
-    # The terminal's Ctrl-C goes to all processes of a group.
-    os.killpg(run.pid, kill) if kill == signal.SIGINT else run.kill()
-    trouble = run.communicate(timeout=60)[1]
+    try:
+        wait_until(lambda: len(log()) >= 2)
+        # The terminal's Ctrl-C goes to all processes of a group.
+        os.killpg(run.pid, kill) if kill == signal.SIGINT else run.kill()
+        trouble = run.communicate(timeout=60)[1]
+    finally:
+        run.kill()
     assert run.returncode != 0
     assert trouble.count("Traceback") == (kill == signal.SIGINT)
     wait_until(lambda: all(is_gone(process) for _, process in log()))

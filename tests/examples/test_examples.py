@@ -47,6 +47,7 @@ def test_every_example_is_tested_and_says_how_it_is_run():
     names = sorted(path.stem for path in EXAMPLES.glob("*.py"))
     assert names == [
         "cleanrl_ppo_cartpole",
+        "planner_in_cvxpy",
         "rllib_ppo_spacecraft",
         "skrl_ppo_cartpole",
         "torchrl_ppo_spacecraft",
