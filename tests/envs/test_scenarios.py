@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -347,3 +348,16 @@ def test_a_grid_of_too_many_cells_is_named():
     ends = np.array([[-4e4, 0.0]]), np.array([[9e4, 0.0]])
     with pytest.raises(ValueError, match="2 overlapping obstacles"):
         way_exists(*ends, centres, np.full(2, 3e4), 0.15)
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_what_is_drawn_is_what_a_check_would_take(name):
+    preset = PRESETS[name]
+    for seed in range(20):
+        drawn = preset.sample(np.random.default_rng(seed))
+        # Built anew from its own numbers, which looks at all of them.
+        assert Scenario(**drawn.to_dict()) == drawn
+        assert pickle.loads(pickle.dumps(drawn)) == drawn
+        for array in (drawn.starts, drawn.goals, drawn.obstacles, drawn.headings):
+            with pytest.raises(ValueError, match="read-only"):
+                array[:] = 0.0

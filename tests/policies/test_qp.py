@@ -92,7 +92,7 @@ def test_a_solver_that_is_not_known_is_refused():
 
 def test_a_solver_that_is_not_installed_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "osqp", None)
-    with pytest.raises(ImportError, match="pip install 'lagros\[train\]'"):
+    with pytest.raises(ImportError, match=r"pip install 'lagros\[train\]'"):
         solve_qp(random_program(0), 1e-8, "osqp")
 
 
