@@ -161,7 +161,7 @@ def test_a_metric_that_is_a_network_is_attacked_by_the_law_of_its_own() -> None:
     assert row["random_broken_rate"] == 0.0
     # Against the u* of the shipped metric it would err by newtons.
     assert row["learning_error_max"] < 1e-3
-    assert row["certified_radius"] is None
+    assert row["certified_radius_max"] is None
 
 
 # Rows.

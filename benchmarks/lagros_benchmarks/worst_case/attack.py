@@ -421,18 +421,19 @@ def _row(
 
 
 def _worst_measures(outcomes: list[Outcome]) -> dict[str, Any]:
-    """Return the largest (of gaps the least) of every number, and the share of every flag."""
+    """Return the largest (of gaps the least) of every number, and the share of every flag.
+
+    What stands for no episode is None, under the name that its figure would have.
+    """
     names = dict.fromkeys(name for one in outcomes for name in one.measures)
     summary: dict[str, Any] = {}
     for name in names:
         values = [one.measures[name] for one in outcomes if one.measures.get(name) is not None]
         numbers = [float(value) for value in values if value is not None]
-        if not numbers:
-            summary[name] = None
-        elif isinstance(values[0], bool):
-            summary[f"{name}_rate"] = sum(numbers) / len(outcomes)
+        if name == "certified_crossed" or any(isinstance(value, bool) for value in values):
+            summary[f"{name}_rate"] = sum(numbers) / len(outcomes) if numbers else None
         elif name in ("least_gap", "success_share", "strict_success_share"):
-            summary[f"{name}_min"] = min(numbers)
+            summary[f"{name}_min"] = min(numbers, default=None)
         else:
-            summary[f"{name}_max"] = max(numbers)
+            summary[f"{name}_max"] = max(numbers, default=None)
     return summary
