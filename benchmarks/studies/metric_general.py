@@ -18,12 +18,12 @@ import json
 import math
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from studies.planar import Car, Pvtol
 
 from lagros_envs.checks import check_whole
 from lagros_envs.dynamics import System
@@ -44,53 +44,6 @@ from lagros_policies.contraction import (
 _DESIGN, _CHECK, _SEARCH = 1, 2, 3  # seeds
 
 
-@dataclass(frozen=True)
-class Car:
-    """A car [x, y, heading, speed] with turn rate [rad/s] and acceleration [m/s^2]."""
-
-    state_dim = 4
-    control_dim = 2
-
-    def derivative(self, state: Sequence[Any], control: Sequence[Any], functions: Any) -> Any:
-        """Return dx/dt."""
-        _, _, heading, speed = state
-        ahead, aside = speed * functions.cos(heading), speed * functions.sin(heading)
-        return ahead, aside, control[0], control[1]
-
-
-@dataclass(frozen=True)
-class Pvtol:
-    """A planar quadrotor [p_x, p_z, roll, v_x, v_z, spin], speeds in its axes, and two rotors [N].
-
-    Attributes:
-        mass: [kg].
-        inertia: [kg m^2].
-        arm: From its middle to a rotor [m].
-        gravity: [m/s^2].
-    """
-
-    mass: float = 0.486
-    inertia: float = 0.00383
-    arm: float = 0.25
-    gravity: float = 9.81
-    state_dim = 6
-    control_dim = 2
-
-    def derivative(self, state: Sequence[Any], control: Sequence[Any], functions: Any) -> Any:
-        """Return dx/dt."""
-        _, _, roll, ahead, up, spin = state
-        right, left = control
-        sine, cosine = functions.sin(roll), functions.cos(roll)
-        return (
-            ahead * cosine - up * sine,
-            ahead * sine + up * cosine,
-            spin,
-            up * spin - self.gravity * sine,
-            -ahead * spin - self.gravity * cosine + (right + left) / self.mass,
-            (right - left) * (self.arm / self.inertia),
-        )
-
-
 def car() -> tuple[System, BoxRegion, CvStemSettings]:
     """Return the car, where its metric must hold, and what to design."""
     region = BoxRegion(
@@ -109,7 +62,7 @@ def car() -> tuple[System, BoxRegion, CvStemSettings]:
 def pvtol() -> tuple[System, BoxRegion, CvStemSettings]:
     """Return the quadrotor, where its metric must hold, and what to design."""
     third, body = math.pi / 3, Pvtol()
-    hover = 0.5 * body.mass * body.gravity
+    hover = body.hover
     region = BoxRegion(
         low=(-5.0, -5.0, -third, -2.0, -1.0, -third),
         high=(5.0, 5.0, third, 2.0, 1.0, third),

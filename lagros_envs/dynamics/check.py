@@ -182,8 +182,8 @@ def _compare(place: str, kind: str, index: int, found: FloatArray, wanted: Float
     if not np.all(np.abs(found - wanted) <= room):
         worst = int(np.argmax(np.abs(found - wanted)))
         raise ValueError(
-            f"{place} gives {found[worst]!r} as rate {index} on {kind} and {wanted[worst]!r} on "
-            "floats: one formula has to hold for every kind of number"
+            f"{place} gives {found[worst]:.6g} as rate {index} on {kind} and {wanted[worst]:.6g} "
+            "on floats: one formula has to hold for every kind of number"
         )
 
 
