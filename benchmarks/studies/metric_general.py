@@ -1,4 +1,4 @@
-"""Metrics of systems that are no cart-pole: a car and a planar quadrotor, designed and checked.
+r"""Metrics of systems that are no cart-pole: a car and a planar quadrotor, designed and checked.
 
 - The car [x, y, heading, speed] is steered by turn rate and acceleration: the controls move all
   that its motion depends on, so that its metric is a function of x_d.
@@ -8,7 +8,8 @@
 Each is designed by CV-STEM over a box in all coordinates, checked on fresh triples that the design
 never saw, and then attacked by a search that follows the worst of them (observed, not proved).
 
-    python benchmarks/studies/metric_general.py [--checks 10000] [--json FILE]
+    OMP_NUM_THREADS=1 python benchmarks/studies/metric_general.py \
+        --json benchmarks/results/metric_general.json
 """
 
 from __future__ import annotations
