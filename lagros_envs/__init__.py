@@ -10,14 +10,14 @@ __version__ = "0.1.0"
 
 register(
     id="lagros/CartPole-v0",
-    entry_point="lagros_envs.cartpole:CartPoleEnv",
-    vector_entry_point="lagros_envs.cartpole_vector:CartPoleVectorEnv",
+    entry_point="lagros_envs.tasks.cartpole.env:CartPoleEnv",
+    vector_entry_point="lagros_envs.tasks.cartpole.vector:CartPoleVectorEnv",
     max_episode_steps=90,  # of the default settings, as below; the environment itself truncates
 )
 
 register(
     id="lagros/Spacecraft-v0",
-    entry_point="lagros_envs.spacecraft_single:SpacecraftEnv",
-    vector_entry_point="lagros_envs.spacecraft_vector:SpacecraftVectorEnv",
+    entry_point="lagros_envs.tasks.spacecraft.single:SpacecraftEnv",
+    vector_entry_point="lagros_envs.tasks.spacecraft.vector:SpacecraftVectorEnv",
     max_episode_steps=450,
 )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
-from lagros_envs.spacecraft import SpacecraftParallelEnv
+from lagros_envs.tasks.spacecraft.parallel import SpacecraftParallelEnv
 
 __all__ = ["env", "parallel_env", "raw_env"]
 

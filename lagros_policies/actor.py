@@ -13,11 +13,11 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs import cartpole_task as task
 from lagros_envs.checks import check_positive, shown
 from lagros_envs.conventions import settings_of
-from lagros_envs.dynamics.cartpole import ANGLE, POSITION
-from lagros_policies.imitation.networks import Mlp, read_safetensors, write_safetensors
+from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.physics import ANGLE, POSITION
+from lagros_policies.learning.networks import Mlp, read_safetensors, write_safetensors
 from lagros_policies.observed import cartpole_rows
 from lagros_policies.trained_for import (
     KEYS,

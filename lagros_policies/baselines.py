@@ -1,7 +1,7 @@
 """Baselines that nothing has trained: LQR and random actions.
 
 Both policies follow stable-baselines3's `PolicyPredictor` protocol. Observations are those of
-`lagros_envs.cartpole`, (13,) or (B, 13); actions are (1,) or (B, 1) float32, in units of
+`lagros_envs.tasks.cartpole.env`, (13,) or (B, 13); actions are (1,) or (B, 1) float32, in units of
 `CartPoleSettings.force_scale` [N].
 """
 
@@ -13,11 +13,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs import cartpole_task as task
 from lagros_envs.checks import check_positive, check_seed, shown
 from lagros_envs.conventions import settings_of
 from lagros_envs.dynamics import linearise_hold
 from lagros_envs.options import real_numbers
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.observed import cartpole_rows
 
 FloatArray = NDArray[np.float64]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from lagros_policies.imitation.network_policy import NetworkPolicy
-from lagros_policies.imitation.spacecraft_policy import SpacecraftNetworkPolicy
+from lagros_policies.learning.network_policy import NetworkPolicy
+from lagros_policies.tasks.spacecraft.network_policy import SpacecraftNetworkPolicy
 
 
 class LearnedPolicy(NetworkPolicy):

@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.cartpole_task import OBSERVATION_DIM
 from lagros_envs.checks import shown
 from lagros_envs.options import real_numbers
+from lagros_envs.tasks.cartpole.task import OBSERVATION_DIM
 
 Number = TypeVar("Number", np.float32, np.float64)
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_flag, shown, suggestion
-from lagros_envs.scenarios import preset_named
-from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.scenarios import preset_named
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.naming import UserClass, model_file, user_class
 from lagros_policies.wrappers import bare_environment
 
@@ -34,10 +34,10 @@ _CARTPOLE = {
 }
 _SPACECRAFT = {
     "learned": "lagros_policies.learned:SpacecraftLearnedPolicy",
-    "tube-mpc": "lagros_policies.distributed:DistributedTubeMpcPolicy",
+    "tube-mpc": "lagros_policies.tasks.spacecraft.distributed:DistributedTubeMpcPolicy",
     "lagros": "lagros_policies.lagros:SpacecraftLagrosPolicy",
-    "centralized": "lagros_policies.centralized:CentralizedPolicy",
-    "ppo": "lagros_policies.spacecraft_ppo:SpacecraftPpoPolicy",
+    "centralized": "lagros_policies.tasks.spacecraft.centralized:CentralizedPolicy",
+    "ppo": "lagros_policies.tasks.spacecraft.ppo:SpacecraftPpoPolicy",
 }
 NAMES = tuple(_CARTPOLE)
 SPACECRAFT_NAMES = tuple(_SPACECRAFT)

@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs import cartpole_task as task
 from lagros_envs.conventions import settings_of
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.actor import Actor, ActorPolicy
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.policy import PolicyState

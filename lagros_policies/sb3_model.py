@@ -11,10 +11,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs import cartpole_task, spacecraft_task
-from lagros_envs.observation import Layout
 from lagros_envs.reading import check_file, parse_json
-from lagros_envs.scenarios import Preset, preset_named
+from lagros_envs.tasks.cartpole import task as cartpole_task
+from lagros_envs.tasks.spacecraft import task as spacecraft_task
+from lagros_envs.tasks.spacecraft.scenarios import Preset, preset_named
+from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.naming import ALGORITHMS
 from lagros_policies.observed import as_numbers
 

@@ -16,12 +16,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.checks import check_flag
 from lagros_envs.dynamics import CartPole
 from lagros_envs.reading import parse_json
-from lagros_envs.scenarios import Preset, preset_named
-from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.spacecraft.scenarios import Preset, preset_named
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 
 TASK, POLICY, SETTINGS = KEYS = ("task", "policy", "trained_for")
 Rule = Literal["equal", "at_most", "one_of"]

@@ -12,16 +12,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs import cartpole_task as task
 from lagros_envs.checks import check_above, check_whole, shown
 from lagros_envs.conventions import settings_of
 from lagros_envs.dynamics import CartPole
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction import ContractionMetric, load_metric
-from lagros_policies.expert import CartPoleExpert, TrackedPlans
 from lagros_policies.observed import cartpole_rows
 from lagros_policies.planning import Trajectory
-from lagros_policies.planning.cartpole import FORCE_SLACK
 from lagros_policies.policy import PolicyState, row_memories
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert, TrackedPlans
+from lagros_policies.tasks.cartpole.planner import FORCE_SLACK
 from lagros_policies.trained_for import cartpole_design, check_trained_for
 
 Float32Array = NDArray[np.float32]

@@ -14,7 +14,7 @@ import pytest
 import typer
 import typer.main
 
-from lagros_benchmarks import cli
+from lagros_benchmarks.commands import cli
 from tests import documents
 
 ROOT = Path(__file__).parents[1]

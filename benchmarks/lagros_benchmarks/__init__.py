@@ -2,18 +2,18 @@
 
 `BenchmarkSettings` says what to run, `run_benchmark` runs it, with policies that are built by their
 names or are objects of your own (with `kept_in` it goes on where it was killed), and `summarise`
-turns the episodes into the rows of the published tables. `lagros_benchmarks.cli` is the same from a
-terminal.
+turns the episodes into the rows of the published tables. `lagros_benchmarks.commands` is the same
+from a terminal.
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lagros_benchmarks.episodes import EpisodeRecord, run_episode
-    from lagros_benchmarks.library import Policy
-    from lagros_benchmarks.records import summarise
-    from lagros_benchmarks.runner import BenchmarkRun, kept_in, run_benchmark
-    from lagros_benchmarks.settings import BenchmarkSettings
+    from lagros_benchmarks.report.records import summarise
+    from lagros_benchmarks.run.episodes import EpisodeRecord, run_episode
+    from lagros_benchmarks.run.library import Policy
+    from lagros_benchmarks.run.runner import BenchmarkRun, kept_in, run_benchmark
+    from lagros_benchmarks.run.settings import BenchmarkSettings
 
 __all__ = [
     "BenchmarkRun",
@@ -27,14 +27,14 @@ __all__ = [
 ]
 
 _HOMES = {
-    "BenchmarkRun": "runner",
-    "BenchmarkSettings": "settings",
-    "EpisodeRecord": "episodes",
-    "Policy": "library",
-    "kept_in": "runner",
-    "run_benchmark": "runner",
-    "run_episode": "episodes",
-    "summarise": "records",
+    "BenchmarkRun": "run.runner",
+    "BenchmarkSettings": "run.settings",
+    "EpisodeRecord": "run.episodes",
+    "Policy": "run.library",
+    "kept_in": "run.runner",
+    "run_benchmark": "run.runner",
+    "run_episode": "run.episodes",
+    "summarise": "report.records",
 }
 
 

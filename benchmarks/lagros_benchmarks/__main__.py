@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import sys
 
-from lagros_benchmarks.extras import install_hint
-from lagros_benchmarks.process import end_with_threads
+from lagros_benchmarks.commands.extras import install_hint
+from lagros_benchmarks.run.process import end_with_threads
 
 
 def main() -> None:
     """Run the command line; where it lacks a package of an extra, say which and end with 1."""
     try:
-        from lagros_benchmarks.cli import app
+        from lagros_benchmarks.commands.cli import app
 
         app(prog_name="lagros")
     except SystemExit as ending:

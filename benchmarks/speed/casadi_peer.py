@@ -14,8 +14,8 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_envs.dynamics.integrate import rk4_hold
+from lagros_envs.tasks.cartpole.physics import ANGLE
 from lagros_policies.planning import CartPolePlanner
 
 FloatArray = NDArray[np.float64]

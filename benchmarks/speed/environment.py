@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401  (registers the environment)
-from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.baselines import LqrPolicy
 from speed.report import Row, Section, timed_row
 from speed.timing import Candidate, Scale, Times, interleave

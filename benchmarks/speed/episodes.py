@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs import cartpole_task as task
 from lagros_envs.seeding import episode_seeds, episode_streams
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.planning import CartPolePlanner, CartPolePlannerSettings, Trajectory
 from speed.timing import Candidate, Scale
 

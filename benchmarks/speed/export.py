@@ -30,8 +30,8 @@ from lagros_policies.export.c99 import TANHS  # noqa: E402
 from lagros_policies.export.cost import footprint  # noqa: E402
 from lagros_policies.export.file import c_file, onnx_file  # noqa: E402
 from lagros_policies.export.source import Source  # noqa: E402
-from lagros_policies.imitation.features import cartpole_features  # noqa: E402
-from lagros_policies.sensed import Sensed  # noqa: E402
+from lagros_policies.tasks.cartpole.features import cartpole_features  # noqa: E402
+from lagros_policies.tasks.spacecraft.sensed import Sensed  # noqa: E402
 from speed.timing import Candidate, interleave  # noqa: E402
 
 # The first is what runs anywhere. C99 mode keeps products and sums apart; the last fuses them.

@@ -15,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 
 import lagros_envs  # noqa: F401  (registers the environments)
-from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from speed import environment
 from speed.ratios import Duel, Peer, variants
 from speed.report import Row, Section, Target, absent_row, timed_row
@@ -178,8 +178,8 @@ def _share_of_learning(scale: Scale) -> Target | Row:
     import torch
     from stable_baselines3 import PPO
 
-    from lagros_benchmarks.sb3_vector import SB3VectorEnv
-    from lagros_envs.cartpole_vector import CartPoleVectorEnv
+    from lagros_benchmarks.training.sb3_vector import SB3VectorEnv
+    from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
 
     torch.set_num_threads(1)
 

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401  (registers the environment)
 from lagros_envs.seeding import episode_seeds
-from lagros_policies.imitation.features import FEATURES, cartpole_features
-from lagros_policies.imitation.network_policy import PRETRAINED
-from lagros_policies.imitation.networks import Mlp
 from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.learning.network_policy import PRETRAINED
+from lagros_policies.learning.networks import Mlp
+from lagros_policies.tasks.cartpole.features import FEATURES, cartpole_features
 from lagros_policies.tube_mpc import TubeMpcPolicy
 from speed.report import Section, Target, absent_row, timed_row
 from speed.timing import Candidate, Scale, Times, interleave
@@ -201,7 +201,10 @@ def _tube_mpc(scale: Scale) -> Section:
 def _tube_mpc_policy() -> tuple[TubeMpcPolicy, str]:
     if (PRETRAINED / "cartpole_metric.json").is_file():
         return TubeMpcPolicy(), "Shipped metric"
-    from lagros_policies.metric_design import MetricDesignSettings, design_cartpole_metric
+    from lagros_policies.tasks.cartpole.metric_design import (
+        MetricDesignSettings,
+        design_cartpole_metric,
+    )
 
     metric = design_cartpole_metric(MetricDesignSettings(plans=60, pool=5000, checks=500))
     return TubeMpcPolicy(metric=metric), "A metric designed just now, as none is shipped"

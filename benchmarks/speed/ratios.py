@@ -317,7 +317,7 @@ def _export(scale: Scale) -> list[Duel | Row]:
     from lagros_policies.export import check, load_source
     from lagros_policies.export.c99 import c_source
     from lagros_policies.export.source import example_observations
-    from lagros_policies.imitation.features import cartpole_features
+    from lagros_policies.tasks.cartpole.features import cartpole_features
 
     if check.compiler() is None:
         return [absent_row("C export, one call", "gcc")]
@@ -349,8 +349,8 @@ def _export(scale: Scale) -> list[Duel | Row]:
 
 
 def _processes(scale: Scale) -> Duel:
-    from lagros_benchmarks.runner import run_benchmark
-    from lagros_benchmarks.settings import BenchmarkSettings
+    from lagros_benchmarks.run.runner import run_benchmark
+    from lagros_benchmarks.run.settings import BenchmarkSettings
 
     def running(jobs: int) -> Candidate:
         # With more than one job a serial pass for the step times follows: one episode of it.

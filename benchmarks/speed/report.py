@@ -121,7 +121,7 @@ def duration(seconds: float | None) -> str:
 
 def surroundings(load_before: float) -> dict[str, Any]:
     """Return machine, versions, threads and load, which every published number needs."""
-    from lagros_benchmarks import records
+    from lagros_benchmarks.report import records
 
     versions = records.versions()
     for package in _PEERS:
@@ -140,7 +140,7 @@ def surroundings(load_before: float) -> dict[str, Any]:
 
 def print_header(console: Console, load: float) -> None:
     """Say what is measured where, and whether the machine is quiet."""
-    from lagros_benchmarks import records
+    from lagros_benchmarks.report import records
 
     console.print(
         f"lagros, speed against peers. {records.machine()['processor']}, Python "

@@ -9,9 +9,9 @@ import cvxpy as cp
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs import cartpole_task as task
 from lagros_envs.dynamics import System, control_matrix, state_dependent_coefficient
-from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
+from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction import (
     CvStemSettings,
     HeldControl,
@@ -23,7 +23,7 @@ from lagros_policies.contraction import (
     robust_control,
 )
 from lagros_policies.contraction.basis import cosine_powers, cosine_rates
-from lagros_policies.metric_design import MetricDesignSettings, tube_samples
+from lagros_policies.tasks.cartpole.metric_design import MetricDesignSettings, tube_samples
 from speed.report import Row, Section, Target, timed_row
 from speed.timing import Scale, interleave
 

@@ -11,8 +11,8 @@ import argparse
 
 import numpy as np
 
-from lagros_envs.scenarios import PRESETS
-from lagros_policies.planning.spacecraft import SpacecraftPlanner
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS
+from lagros_policies.tasks.spacecraft.joint_planner import SpacecraftPlanner
 
 
 def main() -> None:

@@ -24,7 +24,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from lagros_benchmarks.calibration import (
+from lagros_benchmarks.evidence.calibration import (
     CARTPOLE_SCORES,
     SPACECRAFT_SCORES,
     EpisodeScores,
@@ -33,7 +33,7 @@ from lagros_benchmarks.calibration import (
     pretrained_hash,
     spacecraft_scores,
 )
-from lagros_benchmarks.files import write_json
+from lagros_benchmarks.run.files import write_json
 from lagros_benchmarks.worst_case.seeds import CALIBRATION, VERIFICATION
 from lagros_envs.files import write_atomic
 from lagros_policies.contraction.conformal import (

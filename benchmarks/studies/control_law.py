@@ -28,19 +28,22 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from lagros_envs import cartpole_task as task
 from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.dynamics import hold_step
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds, episode_streams
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction import (
     InfeasibleError,
     Metric,
     extreme_eigenvalues,
     robust_control,
 )
-from lagros_policies.expert import CartPoleExpert, TrackedPlans
-from lagros_policies.metric_design import MetricDesignSettings, design_cartpole_metric
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert, TrackedPlans
+from lagros_policies.tasks.cartpole.metric_design import (
+    MetricDesignSettings,
+    design_cartpole_metric,
+)
 
 FloatArray = NDArray[np.float64]
 # (states, step) -> forces.

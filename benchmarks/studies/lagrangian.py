@@ -21,19 +21,19 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from lagros_benchmarks.metrics import cluster_rate_interval, mean_interval
+from lagros_benchmarks.run.metrics import cluster_rate_interval, mean_interval
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
-from lagros_policies.centralized import CentralizedPolicy, CentralizedState
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.double_integrator import certified_margin, design_axis
-from lagros_policies.contraction.lagrangian import (
+from lagros_policies.remarks.lagrangian import (
     SlidingAxis,
     SlidingTracking,
     peak_position_error,
     steady_position_bound,
 )
-from lagros_policies.contraction.wrench_control import WrenchTracking
+from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy, CentralizedState
+from lagros_policies.tasks.spacecraft.wrench_control import WrenchTracking
 
 FloatArray = NDArray[np.float64]
 

@@ -29,9 +29,9 @@ from rich.console import Console
 from rich.table import Table
 from studies.rollouts import Episodes, fly, measures, plan_episodes
 
-from lagros_benchmarks.metrics import wilson_interval
-from lagros_envs import cartpole_task as task
+from lagros_benchmarks.run.metrics import wilson_interval
 from lagros_envs.files import write_atomic
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction import (
     ContractionMetric,
     HeldControl,
@@ -43,15 +43,15 @@ from lagros_policies.contraction import (
     verify_metric,
 )
 from lagros_policies.contraction.cvstem import CvStemSettings
-from lagros_policies.contraction.neural.design import solve_on_pool
-from lagros_policies.contraction.neural.metric import (
+from lagros_policies.remarks.neural.design import solve_on_pool
+from lagros_policies.remarks.neural.metric import (
     NeuralMetric,
     load_neural_metric,
     save_neural_metric,
 )
-from lagros_policies.contraction.neural.training import fit_network
-from lagros_policies.expert import CartPoleExpert
-from lagros_policies.metric_design import MetricDesignSettings, tube_samples
+from lagros_policies.remarks.neural.training import fit_network
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.metric_design import MetricDesignSettings, tube_samples
 
 FloatArray = NDArray[np.float64]
 

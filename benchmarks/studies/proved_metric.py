@@ -17,20 +17,20 @@ from typing import Any
 
 import numpy as np
 
-from lagros_benchmarks.certify_evidence import metric_to_prove
-from lagros_benchmarks.worst_case.cartpole import (
+from lagros_benchmarks.evidence.evidence import metric_to_prove
+from lagros_benchmarks.tasks.cartpole.worst_case import (
     Episodes,
     draw_episodes,
     fly,
     random_pushes,
     tracking_law,
 )
-from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds
+from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction import Metric, load_metric
-from lagros_policies.contraction.proof.cartpole import PROVED_BOX
-from lagros_policies.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.proof import PROVED_BOX
 
 _NAMESPACE = 41
 _BOUND = 0.75

@@ -20,7 +20,7 @@ from typing import Any
 
 from rich.console import Console
 
-from lagros_benchmarks.formats import markdown_table, number, percent, policy_label
+from lagros_benchmarks.report.formats import markdown_table, number, percent, policy_label
 from lagros_envs.files import write_atomic
 
 Row = Mapping[str, Any]

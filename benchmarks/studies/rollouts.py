@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_benchmarks.metrics import mean_interval, wilson_interval
-from lagros_envs import cartpole_task as task
+from lagros_benchmarks.run.metrics import mean_interval, wilson_interval
 from lagros_envs.disturbances import Disturbance
 from lagros_envs.dynamics import CartPole, hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
-from lagros_policies.expert import CartPoleExpert
+from lagros_envs.tasks.cartpole import task
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 FloatArray = NDArray[np.float64]
 # (states (s, 4), step) -> forces (s, 1) [N].

@@ -10,8 +10,8 @@ OSQP, one program at a time.
     python benchmarks/studies/safety_filter.py [--worlds 100] [--planned 20] [--bound 0.2,0.6,1.0]
         [--seed 0] [--json FILE]
 
-The margins and rates of `lagros_policies/barrier.py` were chosen with this straight flight in
-worlds of other seeds (`episode_seeds(n, 100, 12345)` with n from 1 to 13).
+The margins and rates of `lagros_policies/safety/barrier.py` were chosen with this straight flight
+in worlds of other seeds (`episode_seeds(n, 100, 12345)` with n from 1 to 13).
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from rich.console import Console
 from rich.table import Table
 from scipy import sparse
 
-from lagros_benchmarks.metrics import wilson_interval
-from lagros_envs.dynamics.spacecraft import HEADING
+from lagros_benchmarks.run.metrics import wilson_interval
 from lagros_envs.files import write_atomic
-from lagros_envs.observation import Layout
-from lagros_envs.scenarios import PRESETS
 from lagros_envs.seeding import EVALUATION, episode_seeds
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
-from lagros_policies.barrier import BarrierSettings
-from lagros_policies.centralized import CentralizedPolicy
-from lagros_policies.contraction.thrusters import thrust_for_acceleration, to_body
-from lagros_policies.half_planes import nearest
+from lagros_envs.tasks.spacecraft.physics import HEADING
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS
+from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.policy import Policy, PolicyState
-from lagros_policies.safety import SafetyFilter
-from lagros_policies.sensed import Sensed
+from lagros_policies.safety.barrier import BarrierSettings
+from lagros_policies.safety.filter import SafetyFilter
+from lagros_policies.safety.half_planes import nearest
+from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
+from lagros_policies.tasks.spacecraft.sensed import Sensed
+from lagros_policies.tasks.spacecraft.thrusters import thrust_for_acceleration, to_body
 
 PRESET, AGENTS = "paper", 6
 SETTINGS = SpacecraftSettings()

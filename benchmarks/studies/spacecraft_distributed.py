@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from lagros_benchmarks.metrics import wilson_interval
+from lagros_benchmarks.run.metrics import wilson_interval
 from lagros_envs import spacecraft_v0
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import EVALUATION, episode_seeds
-from lagros_envs.spacecraft import SpacecraftParallelEnv
-from lagros_policies.distributed import DistributedTubeMpcPolicy
+from lagros_envs.tasks.spacecraft.parallel import SpacecraftParallelEnv
+from lagros_policies.tasks.spacecraft.distributed import DistributedTubeMpcPolicy
 
 PRESET, AGENTS = "paper", 6
 _WIDTH = 180  # of the table, whatever the terminal

@@ -20,17 +20,17 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from lagros_benchmarks.metrics import wilson_interval
-from lagros_benchmarks.reproduce_spacecraft import SpacecraftReproduceSettings, training_part
+from lagros_benchmarks.run.metrics import wilson_interval
+from lagros_benchmarks.tasks.spacecraft.reproduce import SpacecraftReproduceSettings, training_part
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
-from lagros_policies.imitation.deep_set import DeepSet
-from lagros_policies.imitation.spacecraft_flights import fly_expert
-from lagros_policies.imitation.spacecraft_policy import SpacecraftNetworkPolicy
-from lagros_policies.imitation.train_deep_set import fit_deep_set, flight_samples, join
-from lagros_policies.safety import SafetyFilter
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+from lagros_policies.learning.deep_set import DeepSet
+from lagros_policies.learning.train_deep_set import fit_deep_set, flight_samples, join
+from lagros_policies.safety.filter import SafetyFilter
+from lagros_policies.tasks.spacecraft.flights import fly_expert
+from lagros_policies.tasks.spacecraft.network_policy import SpacecraftNetworkPolicy
 
 AGENTS = 6
 STUDY = 4242  # namespace of the worlds of this study

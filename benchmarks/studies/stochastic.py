@@ -28,13 +28,13 @@ from lagros_envs.dynamics import Spacecraft
 from lagros_envs.files import write_atomic
 from lagros_policies.contraction.control import error_energy
 from lagros_policies.contraction.double_integrator import design_axis
-from lagros_policies.contraction.stochastic import (
+from lagros_policies.remarks.stochastic import (
     held_mean_square,
     mean_square_bound,
     noisy_hold_step,
 )
-from lagros_policies.contraction.wrench_control import WrenchTracking
-from lagros_policies.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
+from lagros_policies.tasks.spacecraft.wrench_control import WrenchTracking
 
 FloatArray = NDArray[np.float64]
 

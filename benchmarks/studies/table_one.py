@@ -26,15 +26,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401  (registers the environment)
-from lagros_benchmarks.certify import certify_cartpole
-from lagros_benchmarks.certify_evidence import recorded_error
-from lagros_envs import cartpole_task as task
+from lagros_benchmarks.commands.certify import certify_cartpole
+from lagros_benchmarks.evidence.evidence import recorded_error
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction import diverging_bound
 from lagros_policies.contraction.tube import Tube
-from lagros_policies.expert import CartPoleExpert
 from lagros_policies.policy import make
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 FloatArray = NDArray[np.float64]
 

@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tubes_flights import PERIOD, SETTLED, UPRIGHT, AnyTube, attack, resting_plans, settled_plans
 
-from lagros_envs import cartpole_task as task
 from lagros_envs.files import write_atomic
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.double_integrator import (
     certified_margin,
@@ -38,11 +38,6 @@ from lagros_policies.contraction.double_integrator import (
     state_tube,
 )
 from lagros_policies.contraction.ellipsoid import TubeProof, prove_tube
-from lagros_policies.contraction.ellipsoid_axis import (
-    design_axis_ellipsoid,
-    prove_axis_ellipsoid,
-    worst_output,
-)
 from lagros_policies.contraction.held_design import (
     HeldDesign,
     HeldTube,
@@ -50,8 +45,13 @@ from lagros_policies.contraction.held_design import (
     design_held_contained,
 )
 from lagros_policies.contraction.held_ellipsoid import HeldTubeProof, prove_held_tube
-from lagros_policies.contraction.proof.spacecraft import prove_axis
 from lagros_policies.contraction.tube_design import PlanBox, TubeDesign, design_contained
+from lagros_policies.tasks.spacecraft.ellipsoid_axis import (
+    design_axis_ellipsoid,
+    prove_axis_ellipsoid,
+    worst_output,
+)
+from lagros_policies.tasks.spacecraft.proof import prove_axis
 
 FloatArray = NDArray[np.float64]
 

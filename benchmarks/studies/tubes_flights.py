@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.worst_case.search import SearchSettings, search
-from lagros_envs import cartpole_task as task
 from lagros_envs.disturbances import Disturbance, into_unit_ball, onto_unit_sphere
 from lagros_envs.dynamics import hold_step, vector_field
 from lagros_envs.seeding import episode_seeds, episode_streams
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction.ellipsoid import TubeControl
 from lagros_policies.contraction.held_design import HeldTube
 from lagros_policies.contraction.tube_design import ConstantTube, PlanBox

@@ -21,16 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 from tubes_flights import NAMESPACE, PERIOD, UPRIGHT, resting_plans, steepest_share
 
-from lagros_benchmarks.worst_case.cartpole import draw_episodes, random_pushes
-from lagros_envs import cartpole_task as task
+from lagros_benchmarks.tasks.cartpole.worst_case import draw_episodes, random_pushes
 from lagros_envs.dynamics import hold_step
 from lagros_envs.dynamics.integrate import SUBSTEPS
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.held_design import HeldDesign, design_held_contained
 from lagros_policies.contraction.tube_design import TubeDesign, design_contained
-from lagros_policies.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 FloatArray = NDArray[np.float64]
 

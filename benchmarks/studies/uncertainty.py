@@ -28,25 +28,25 @@ from rich.console import Console
 from rich.table import Table
 from studies.rollouts import Episodes, Law, fly, measures, plan_episodes
 
-from lagros_benchmarks.canvas import canvas, check_figure_path, curve, save, styles
-from lagros_benchmarks.metrics import cluster_rate_interval
-from lagros_envs import cartpole_task as task
+from lagros_benchmarks.report.canvas import canvas, check_figure_path, curve, save, styles
+from lagros_benchmarks.run.metrics import cluster_rate_interval
 from lagros_envs.dynamics import CartPole
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.actor import PpoPolicy
 from lagros_policies.baselines import LqrPolicy
-from lagros_policies.centralized import CentralizedPolicy
-from lagros_policies.contraction.adaptive import (
+from lagros_policies.contraction.feedback import preferred_deviation
+from lagros_policies.lagros import LagrosPolicy, SpacecraftLagrosPolicy
+from lagros_policies.remarks.adaptive import (
     AdaptiveControl,
     cart_mass_regressor,
     friction_regressor,
     largest_gain,
 )
-from lagros_policies.contraction.feedback import preferred_deviation
-from lagros_policies.expert import CartPoleExpert
-from lagros_policies.lagros import LagrosPolicy, SpacecraftLagrosPolicy
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
+from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
 
 FloatArray = NDArray[np.float64]
 Seen = Callable[[FloatArray, FloatArray, int], None]

@@ -18,8 +18,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from lagros_benchmarks.calibration import pretrained_hash
-from lagros_benchmarks.files import plain, write_json
+from lagros_benchmarks.evidence.calibration import pretrained_hash
+from lagros_benchmarks.run.files import plain, write_json
 from lagros_benchmarks.worst_case.attack import AttackSettings, run_attack
 from lagros_benchmarks.worst_case.replay import save_worst_cases
 from lagros_benchmarks.worst_case.search import SearchSettings

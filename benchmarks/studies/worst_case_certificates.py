@@ -37,23 +37,23 @@ from rich.console import Console
 from rich.table import Table
 from worst_case_tracking import KINDS, SEED, SPACECRAFT_BOUNDS, drawn, spacecraft_case
 
-from lagros_benchmarks.calibration import pretrained_hash
-from lagros_benchmarks.files import plain, write_json
-from lagros_benchmarks.worst_case import cartpole
+from lagros_benchmarks.evidence.calibration import pretrained_hash
+from lagros_benchmarks.run.files import plain, write_json
+from lagros_benchmarks.tasks.cartpole import worst_case as cartpole
 from lagros_benchmarks.worst_case.certificate import CertificateTarget, TubeCheck
 from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_benchmarks.worst_case.seeds import ATTACK
-from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.dynamics import hold_step
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds, episode_streams
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tube import PaperTube
 from lagros_policies.contraction.held_design import HeldDesign, HeldTube, design_held_contained
 from lagros_policies.contraction.held_ellipsoid import prove_held_tube
 from lagros_policies.contraction.tube_design import PlanBox
-from lagros_policies.expert import CartPoleExpert
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.planning import CartPolePlanner
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

@@ -19,8 +19,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from lagros_benchmarks.files import write_json
-from lagros_benchmarks.worst_case.cartpole import (
+from lagros_benchmarks.run.files import write_json
+from lagros_benchmarks.tasks.cartpole.worst_case import (
     CartPoleTarget,
     draw_episodes,
     energy_adversary,
@@ -30,8 +30,8 @@ from lagros_benchmarks.worst_case.optimisers import OPTIMISERS
 from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_benchmarks.worst_case.seeds import ATTACK
 from lagros_envs.seeding import episode_seeds
-from lagros_policies.expert import CartPoleExpert
 from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 COMMAND = "python benchmarks/studies/worst_case_methods.py"
 # Another run than the published attack, whose episodes must not choose its method.

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_benchmarks.tasks.spacecraft.plane import worst_plane_pushes
 from lagros_benchmarks.worst_case.optimisers import make_search
-from lagros_benchmarks.worst_case.plane import worst_plane_pushes
 from lagros_benchmarks.worst_case.seeds import ATTACK
 from lagros_envs.disturbances import Disturbance, onto_unit_sphere
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
-from lagros_policies.centralized import CentralizedPolicy
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.double_integrator import certified_margin
+from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
 
 FloatArray = NDArray[np.float64]
 

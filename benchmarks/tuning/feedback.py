@@ -34,15 +34,15 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from lagros_benchmarks.files import write_json
-from lagros_benchmarks.records import versions
-from lagros_envs import cartpole_task as task
+from lagros_benchmarks.report.records import versions
+from lagros_benchmarks.run.files import write_json
 from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.dynamics import hold_step, linearise_hold
 from lagros_envs.dynamics.integrate import rk4_hold
 from lagros_envs.seeding import episode_seeds, episode_streams
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction.feedback import _TERMINAL_WEIGHT, FeedbackSettings, WeightSchedule
-from lagros_policies.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 FloatArray = NDArray[np.float64]
 Weights = dict[str, torch.Tensor]

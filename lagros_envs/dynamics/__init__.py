@@ -6,10 +6,8 @@ of your own on every kind of number.
 `straight_line`, `held` and `compiled` run a held step without the overhead of calling the two.
 """
 
-from lagros_envs.dynamics.cartpole import CartPole
 from lagros_envs.dynamics.check import check_system
 from lagros_envs.dynamics.integrate import hold_control_slope, hold_step, linearise_hold
-from lagros_envs.dynamics.spacecraft import Spacecraft
 from lagros_envs.dynamics.system import (
     Components,
     Functions,
@@ -19,6 +17,8 @@ from lagros_envs.dynamics.system import (
     state_dependent_coefficient,
     vector_field,
 )
+from lagros_envs.tasks.cartpole.physics import CartPole
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
 
 __all__ = [
     "CartPole",

@@ -20,7 +20,7 @@ from scipy import sparse
 
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 from lagros_envs.dynamics import System, vector_field
-from lagros_envs.dynamics.cartpole import ANGLE
+from lagros_envs.tasks.cartpole.physics import ANGLE
 from lagros_policies.contraction.basis import CONSTANT, Basis, cosines
 from lagros_policies.contraction.condition import condition_terms
 from lagros_policies.contraction.places import Point

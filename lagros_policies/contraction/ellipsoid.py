@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from lagros_envs.dynamics import CartPole, control_matrix, vector_field
 from lagros_envs.numbers import Interval, exact
 from lagros_policies.contraction.metric import Metric
-from lagros_policies.contraction.proof.cells import Examined, Search, search
-from lagros_policies.contraction.proof.matrices import negative_definite
-from lagros_policies.contraction.proof.rates import RateCondition, Violation, rate_condition
 from lagros_policies.contraction.regions import Region
 from lagros_policies.contraction.systems import check_cartpole
 from lagros_policies.contraction.tube_design import ConstantTube, TubeDesign
+from lagros_policies.proof.cells import Examined, Search, search
+from lagros_policies.proof.matrices import negative_definite
+from lagros_policies.proof.rates import RateCondition, Violation, rate_condition
 
 FloatArray = NDArray[np.float64]
 

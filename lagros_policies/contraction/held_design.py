@@ -38,12 +38,12 @@ from scipy import sparse
 
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 from lagros_envs.dynamics import System, control_matrix, jacobian
-from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
+from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.cvstem import InfeasibleError
-from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.semidefinite import solve_conic, svec, symmetric_basis
 from lagros_policies.contraction.systems import check_cartpole
 from lagros_policies.contraction.tube_design import PlanBox, self_contained
+from lagros_policies.proof.box import ProofBox
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

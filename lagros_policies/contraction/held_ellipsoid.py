@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from lagros_envs.dynamics import CartPole
 from lagros_envs.numbers import Interval, exact
 from lagros_policies.contraction.held_design import HeldTube, bernstein_rate
-from lagros_policies.contraction.proof.cells import Search, search
-from lagros_policies.contraction.proof.lifted import LiftedCondition
-from lagros_policies.contraction.proof.matrices import matmul, negative_definite, transpose
-from lagros_policies.contraction.proof.rates import Violation
 from lagros_policies.contraction.statement import Statement, at_most
 from lagros_policies.contraction.systems import check_cartpole
+from lagros_policies.proof.cells import Search, search
+from lagros_policies.proof.lifted import LiftedCondition
+from lagros_policies.proof.matrices import matmul, negative_definite, transpose
+from lagros_policies.proof.rates import Violation
 
 FloatArray = NDArray[np.float64]
 

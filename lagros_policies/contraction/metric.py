@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_at_least, check_name, check_positive, check_whole
-from lagros_envs.dynamics.cartpole import ANGLE
+from lagros_envs.tasks.cartpole.physics import ANGLE
 from lagros_policies.contraction.basis import CONSTANT, MOST_DEGREE, Basis, cosines
 from lagros_policies.contraction.places import (
     Point,

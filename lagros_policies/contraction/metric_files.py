@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from lagros_envs.checks import check_name, check_positive, shown
-from lagros_envs.dynamics.cartpole import ANGLE
 from lagros_envs.files import write_atomic
 from lagros_envs.reading import MOST_TEXT, Record, named, parse_json, read_bytes
+from lagros_envs.tasks.cartpole.physics import ANGLE
 from lagros_policies.contraction.basis import Basis, cosines
 from lagros_policies.contraction.metric import ContractionMetric, Metric, Verification
 from lagros_policies.contraction.regions import BoxRegion, MetricRegion, PlanRegion, Region
@@ -158,7 +158,7 @@ def load_metric(path: Path | str | None = None, states: int | None = None) -> Me
         raise ValueError(
             f"{named(path)} is no JSON: a network is neither read nor proved here, only a "
             "polynomial is. Give a file of save_metric, as `python -m "
-            "lagros_policies.contraction.proof.design --out FILE` writes; for networks there is "
+            "lagros_policies.tasks.cartpole.proof_design --out FILE` writes; for networks there is "
             "load_neural_metric, and their condition is checked on samples"
         )
     record = Record(parse_json(data, named(path), "a metric written by save_metric"), named(path))

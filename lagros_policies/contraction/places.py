@@ -8,7 +8,7 @@ from typing import Literal, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics.cartpole import ANGLE
+from lagros_envs.tasks.cartpole.physics import ANGLE
 from lagros_policies.contraction.basis import CONSTANT, Basis
 from lagros_policies.contraction.regions import MetricRegion, Region, Samples, search_region
 

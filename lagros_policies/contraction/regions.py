@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_fields, check_positive, check_whole
-from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE
+from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

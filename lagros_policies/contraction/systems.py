@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import shown
 from lagros_envs.dynamics import CartPole, System
-from lagros_envs.dynamics.cartpole import ANGLE
-from lagros_envs.dynamics.spacecraft import Spacecraft
+from lagros_envs.tasks.cartpole.physics import ANGLE
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.contraction.basis import Basis, cosines
 from lagros_policies.contraction.metric import DualMetric, Metric
 from lagros_policies.contraction.regions import Region

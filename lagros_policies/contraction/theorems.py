@@ -39,10 +39,10 @@ from lagros_envs.numbers import Interval, exact, variable
 from lagros_policies.contraction.condition import Samples, condition_left
 from lagros_policies.contraction.control import contraction_terms
 from lagros_policies.contraction.metric import DualMetric, Metric, metric_place
-from lagros_policies.contraction.proof.box import ProofBox
-from lagros_policies.contraction.proof.matrices import negative_definite
-from lagros_policies.contraction.proof.motion import accelerations, jacobian_parts, metric_series
 from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
+from lagros_policies.proof.box import ProofBox
+from lagros_policies.proof.matrices import negative_definite
+from lagros_policies.proof.motion import accelerations, jacobian_parts, metric_series
 
 FloatArray = NDArray[np.float64]
 

@@ -30,11 +30,11 @@ from scipy import sparse
 
 from lagros_envs.checks import check_fields, check_not_negative, check_positive
 from lagros_envs.dynamics import System, control_matrix, jacobian
-from lagros_envs.dynamics.cartpole import ANGLE, ANGULAR_RATE, VELOCITY
+from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.cvstem import InfeasibleError
-from lagros_policies.contraction.proof.condition import ProofBox
 from lagros_policies.contraction.semidefinite import solve_conic, svec, symmetric_basis
 from lagros_policies.contraction.systems import check_cartpole
+from lagros_policies.proof.condition import ProofBox
 
 FloatArray = NDArray[np.float64]
 Method = Literal["paper", "output", "ellipsoid"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from lagros_policies.export.c99 import Tanh, c_source
 from lagros_policies.export.onnx import policy_model
 from lagros_policies.export.source import Source, SpacecraftSource
-from lagros_policies.export.spacecraft_c99 import spacecraft_source
-from lagros_policies.export.spacecraft_onnx import spacecraft_model
+from lagros_policies.tasks.spacecraft.c99 import spacecraft_source
+from lagros_policies.tasks.spacecraft.onnx import spacecraft_model
 
 
 def c_file(source: Source, tanh: Tanh = "rational") -> str:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs import cartpole_task as task
-from lagros_envs.dynamics.cartpole import ANGLE
+from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.physics import ANGLE
 from lagros_policies.export.onnx_bytes import BATCH, model, node, tensor
 from lagros_policies.export.source import NetworkSource
-from lagros_policies.imitation.features import FEATURES, cartpole_features
-from lagros_policies.imitation.networks import Mlp
+from lagros_policies.learning.networks import Mlp
+from lagros_policies.tasks.cartpole.features import FEATURES, cartpole_features
 
 Float32Array = NDArray[np.float32]
 

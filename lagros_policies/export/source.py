@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs import cartpole_task as task
-from lagros_envs.observation import Layout
-from lagros_envs.scenarios import Preset
-from lagros_envs.spacecraft_task import THRUSTERS, SpacecraftSettings
-from lagros_policies.imitation.deep_set import DeepSet
-from lagros_policies.imitation.features import cartpole_features
-from lagros_policies.imitation.network_policy import PRETRAINED, NetworkPolicy
-from lagros_policies.imitation.networks import Mlp
-from lagros_policies.imitation.spacecraft_policy import SpacecraftNetworkPolicy
+from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.spacecraft.scenarios import Preset
+from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_envs.tasks.spacecraft.task import THRUSTERS, SpacecraftSettings
 from lagros_policies.lagros import LagrosPolicy, SpacecraftLagrosPolicy
 from lagros_policies.learned import LearnedPolicy, SpacecraftLearnedPolicy
+from lagros_policies.learning.deep_set import DeepSet
+from lagros_policies.learning.network_policy import PRETRAINED, NetworkPolicy
+from lagros_policies.learning.networks import Mlp
+from lagros_policies.tasks.cartpole.features import cartpole_features
+from lagros_policies.tasks.spacecraft.network_policy import SpacecraftNetworkPolicy
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]

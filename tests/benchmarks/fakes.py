@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lagros_benchmarks.library import Toolbox
+from lagros_benchmarks.run.library import Toolbox
 
 STEPS = 90
 # A linear-quadratic gain about the upright, and the force of the action 1.0 [N].

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lagros_benchmarks.runner import kept_in, run_benchmark
-from lagros_benchmarks.settings import BenchmarkSettings
+from lagros_benchmarks.run.runner import kept_in, run_benchmark
+from lagros_benchmarks.run.settings import BenchmarkSettings
 from lagros_envs import files
 from tests.benchmarks import fakes, spacecraft_fakes
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from lagros_benchmarks.library import Toolbox
-from lagros_envs.dynamics.spacecraft import Spacecraft
-from lagros_policies.contraction.thrusters import thrust_for_acceleration
+from lagros_benchmarks.run.library import Toolbox
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
+from lagros_policies.tasks.spacecraft.thrusters import thrust_for_acceleration
 
 # Gains towards the goal, critically damped [1/s^2, 1/s].
 STIFFNESS, DAMPING = 0.16, 0.8

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from lagros_benchmarks.cli import app
+from lagros_benchmarks.commands.cli import app
 from lagros_benchmarks.worst_case.replay import load_worst_cases, save_worst_cases
 
 RUNNER = CliRunner()

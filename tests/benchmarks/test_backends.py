@@ -19,13 +19,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from lagros_benchmarks import cli
-from lagros_benchmarks.files import plain
-from lagros_benchmarks.records import summarise
-from lagros_benchmarks.reproduce import ReproduceSettings
-from lagros_benchmarks.reproduction import reproduce
-from lagros_benchmarks.runner import run_benchmark
-from lagros_benchmarks.settings import BenchmarkSettings
+from lagros_benchmarks.commands import cli
+from lagros_benchmarks.report.records import summarise
+from lagros_benchmarks.run.files import plain
+from lagros_benchmarks.run.reproduction import reproduce
+from lagros_benchmarks.run.runner import run_benchmark
+from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_benchmarks.tasks.cartpole.reproduce import ReproduceSettings
 from lagros_policies.backends import (
     ATTEMPTS,
     LOKY,
@@ -38,8 +38,8 @@ from lagros_policies.backends import (
 )
 from lagros_policies.backends import loky as processes
 from lagros_policies.contraction import load_metric
-from lagros_policies.imitation.dataset import ExpertDataSettings, generate
-from lagros_policies.imitation.spacecraft_flights import FlightSettings, fly_expert
+from lagros_policies.learning.dataset import ExpertDataSettings, generate
+from lagros_policies.tasks.spacecraft.flights import FlightSettings, fly_expert
 from tests.benchmarks import fakes, fragile
 
 DASK = Backend("dask")

@@ -11,13 +11,14 @@ import pytest
 from rich.cells import cell_len
 from typer.testing import CliRunner
 
-from lagros_benchmarks import certify, certify_evidence, cli
+from lagros_benchmarks.commands import certify, cli
+from lagros_benchmarks.evidence import evidence as certify_evidence
 from lagros_policies.contraction import load_metric, save_metric
 from lagros_policies.contraction.certificate import Certificate, TubeSizes
-from lagros_policies.contraction.ellipsoid_axis import AxisEllipsoid, prove_axis_ellipsoid
 from lagros_policies.contraction.metric_files import metric_record
-from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.statement import Statement
+from lagros_policies.proof.box import ProofBox
+from lagros_policies.tasks.spacecraft.ellipsoid_axis import AxisEllipsoid, prove_axis_ellipsoid
 
 
 @pytest.fixture
@@ -202,7 +203,7 @@ def test_nested_brackets_without_end_are_no_metric(invoke, tmp_path):
 
 def test_the_largest_multiple_of_a_box_is_found(monkeypatch):
     """With a proof that succeeds up to a size: to a hundredth, from above and from below."""
-    from lagros_benchmarks import certify_box
+    from lagros_benchmarks.tasks.cartpole import certified_box as certify_box
 
     class Proof:
         def __init__(self, size, limit):
@@ -237,8 +238,8 @@ def test_the_largest_multiple_of_a_box_is_found(monkeypatch):
 
 
 def test_a_multiple_of_the_box_is_proved_as_it_is(system_of_task):
-    from lagros_benchmarks import certify_box
-    from lagros_policies.contraction.proof.condition import prove_contraction
+    from lagros_benchmarks.tasks.cartpole import certified_box as certify_box
+    from lagros_policies.proof.condition import prove_contraction
 
     metric = certify_box.load_cartpole_metric(certify_evidence.metric_to_prove(None)[0])
     box, first, second = certify_box.prove_multiple(metric, 0.1, 20.0)
@@ -301,13 +302,13 @@ def test_flights_add_what_was_observed(system_of_task):
 
 @pytest.fixture
 def system_of_task():
-    from lagros_envs.cartpole_task import CartPoleSettings
+    from lagros_envs.tasks.cartpole.task import CartPoleSettings
 
     return CartPoleSettings().system
 
 
 def test_flights_that_serve_several_bounds_are_timed_once(monkeypatch):
-    from lagros_benchmarks import calibration
+    from lagros_benchmarks.evidence import calibration
 
     values = {one.name: np.arange(40.0) for one in calibration.CARTPOLE_SCORES}
     scores = calibration.EpisodeScores(values, 0, 6.0)

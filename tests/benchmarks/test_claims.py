@@ -8,21 +8,21 @@ from typing import Any
 import pytest
 
 import lagros_policies
-from lagros_benchmarks.claims import position_margin
-from lagros_benchmarks.records import summarise
-from lagros_benchmarks.runner import run_benchmark
-from lagros_benchmarks.settings import BenchmarkSettings
-from lagros_benchmarks.tables import csv_text
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
-from lagros_policies.centralized import CentralizedPolicy
+from lagros_benchmarks.evidence.claims import position_margin
+from lagros_benchmarks.report.records import summarise
+from lagros_benchmarks.report.tables import csv_text
+from lagros_benchmarks.run.runner import run_benchmark
+from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.double_integrator import certified_margin
-from lagros_policies.contraction.lagrangian import steady_position_bound
-from lagros_policies.safety import SafetyFilter
+from lagros_policies.remarks.lagrangian import steady_position_bound
+from lagros_policies.safety.filter import SafetyFilter
+from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
 from tests.benchmarks import fakes
 
 CARTPOLE = ("learned", "lagros", "tube-mpc", "lqr", "ppo", "sac", "td3", "residual", "random")
-SLIDING = "lagros_policies.options:SlidingCentralizedPolicy"
+SLIDING = "lagros_policies.remarks.policies:SlidingCentralizedPolicy"
 
 
 @pytest.mark.parametrize("channels", ["all", "rates"])

@@ -10,7 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 import lagros_policies
-from lagros_benchmarks import cli, library
+from lagros_benchmarks.commands import cli
+from lagros_benchmarks.run import library
 from lagros_envs.disturbances import KINDS
 from tests.benchmarks import fakes
 
@@ -32,7 +33,7 @@ def faked(monkeypatch):
         return fakes.make_policy(makers[name], env, settings)
 
     toolbox = library.Toolbox(make, fakes.easy_planner, fakes.load_metric)
-    monkeypatch.setattr("lagros_benchmarks.runner.Toolbox", lambda: toolbox)
+    monkeypatch.setattr("lagros_benchmarks.run.runner.Toolbox", lambda: toolbox)
 
 
 @pytest.mark.parametrize(
@@ -118,7 +119,7 @@ def test_missing_weights_end_with_status_1_and_a_sentence(invoke, faked, monkeyp
         raise FileNotFoundError("no weights")
 
     toolbox = library.Toolbox(absent, fakes.easy_planner, fakes.load_metric)
-    monkeypatch.setattr("lagros_benchmarks.runner.Toolbox", lambda: toolbox)
+    monkeypatch.setattr("lagros_benchmarks.run.runner.Toolbox", lambda: toolbox)
     result = invoke("bench", "cartpole")
     assert result.exit_code == 1
     assert "policy 'learned' cannot be built: FileNotFoundError: no weights" in result.stderr
@@ -142,7 +143,8 @@ def test_no_arguments_show_the_help(invoke):
 
 
 def test_help_imports_nothing_heavy():
-    code = f"import sys, lagros_benchmarks.cli; print([m for m in {HEAVY} if m in sys.modules])"
+    command = "lagros_benchmarks.commands.cli"
+    code = f"import sys, {command}; print([m for m in {HEAVY} if m in sys.modules])"
     output = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lagros_envs  # noqa: F401
-from lagros_benchmarks.episodes import run_episode
+from lagros_benchmarks.run.episodes import run_episode
 from tests.benchmarks.fakes import (
     DrawingPolicy,
     IdlePolicy,
@@ -154,7 +154,7 @@ def test_a_policy_that_draws_does_so_from_the_stream_of_the_episode(env):
 def test_the_time_of_a_slow_step_is_measured_and_its_deadline_missed(env, monkeypatch):
     # A clock that stands still except inside the second call, which takes a second.
     ticks = iter([0.0, 0.01, 1.0, 2.0, *np.repeat(3.0, 400)])
-    monkeypatch.setattr("lagros_benchmarks.flying.perf_counter", lambda: next(ticks))
+    monkeypatch.setattr("lagros_benchmarks.run.flying.perf_counter", lambda: next(ticks))
     record = run_episode(env, LinearPolicy(), 3, None)
     assert record.step_times[:3].tolist() == [0.01, 1.0, 0.0]
     assert record.deadline_misses == 1

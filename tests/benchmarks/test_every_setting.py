@@ -148,7 +148,7 @@ def test_numbers_of_numpy_pass_and_settings_can_be_changed_by_replace(kind):
     [("episodes", 10**12), ("jobs", 10**6), ("chunk", 10**12), ("timing_episodes", 10**12)],
 )
 def test_counts_that_no_machine_holds_are_refused(name, most):
-    from lagros_benchmarks.settings import BenchmarkSettings
+    from lagros_benchmarks.run.settings import BenchmarkSettings
 
     with pytest.raises(ValueError, match=f"{name}={most} must be a whole number, 1 to"):
         BenchmarkSettings(**{name: most})
@@ -156,7 +156,7 @@ def test_counts_that_no_machine_holds_are_refused(name, most):
 
 @pytest.mark.parametrize("given", [None, [], "lqr", {"lqr": 5}, {"lqr": {1: 2}}, {"lqr": None}])
 def test_settings_of_policies_are_mappings(given):
-    from lagros_benchmarks.settings import BenchmarkSettings
+    from lagros_benchmarks.run.settings import BenchmarkSettings
 
     with pytest.raises(ValueError, match=r"^policy_settings=.+ must be mappings"):
         BenchmarkSettings(policies=("lqr",), policy_settings=given)
@@ -164,8 +164,8 @@ def test_settings_of_policies_are_mappings(given):
 
 @pytest.mark.parametrize("count", [10**4, 10**6, 10**12])
 def test_worlds_of_more_agents_than_memory_holds_are_refused(count):
-    from lagros_benchmarks.settings import BenchmarkSettings
-    from lagros_envs.scenarios import preset_named
+    from lagros_benchmarks.run.settings import BenchmarkSettings
+    from lagros_envs.tasks.spacecraft.scenarios import preset_named
 
     with pytest.raises(ValueError, match=f"agents={count} must be a whole number, 1 to"):
         BenchmarkSettings.for_task("spacecraft", agents=(count,))
@@ -175,8 +175,8 @@ def test_worlds_of_more_agents_than_memory_holds_are_refused(count):
 
 @pytest.mark.parametrize("time", [0.0, 1e-12, 0.05, 1e9, 1e300, 10**400])
 def test_an_episode_has_a_step_and_not_endlessly_many(time):
-    from lagros_envs.cartpole_task import CartPoleSettings
-    from lagros_envs.spacecraft_task import SpacecraftSettings
+    from lagros_envs.tasks.cartpole.task import CartPoleSettings
+    from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 
     for kind in (CartPoleSettings, SpacecraftSettings):
         with pytest.raises(ValueError, match="time_limit="):

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from lagros_benchmarks import cli
+from lagros_benchmarks.commands import cli
 from lagros_policies.export import check, load_source
 from lagros_policies.export.cost import footprint
 from lagros_policies.export.source import example_observations
-from lagros_policies.imitation.networks import Mlp
+from lagros_policies.learning.networks import Mlp
 
 
 @pytest.fixture

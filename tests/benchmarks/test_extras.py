@@ -14,8 +14,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from lagros_benchmarks import cli, library
-from lagros_benchmarks.extras import MODULES, install_hint
+from lagros_benchmarks.commands import cli
+from lagros_benchmarks.commands.extras import MODULES, install_hint
+from lagros_benchmarks.run import library
 from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
 from tests.benchmarks import fakes
 from tests.lowest import lowest
@@ -118,7 +119,7 @@ def outcomes(project, commands, folder):
     """Exit status and words of commands, with `lagros[bench]` alone, in one process."""
     code = f"""{absent(with_extra_alone(project, "bench"))}
 from typer.testing import CliRunner
-from lagros_benchmarks import cli
+from lagros_benchmarks.commands import cli
 
 for arguments in {[arguments.split() for arguments in commands]!r}:
     result = CliRunner().invoke(cli.app, arguments)
@@ -252,7 +253,7 @@ def test_the_hint_is_found_behind_the_error_that_it_caused(monkeypatch, tmp_path
         raise ModuleNotFoundError("No module named 'clarabel'", name="clarabel")
 
     toolbox = library.Toolbox(absent, fakes.easy_planner, fakes.load_metric)
-    monkeypatch.setattr("lagros_benchmarks.runner.Toolbox", lambda: toolbox)
+    monkeypatch.setattr("lagros_benchmarks.run.runner.Toolbox", lambda: toolbox)
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(cli.app, ["bench", "cartpole"])
     assert result.exit_code == 1

@@ -9,10 +9,10 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from lagros_benchmarks.library import SetupError, Toolbox
-from lagros_benchmarks.records import summarise
-from lagros_benchmarks.runner import fly_scene, kept_in, run_benchmark
-from lagros_benchmarks.settings import BenchmarkSettings
+from lagros_benchmarks.report.records import summarise
+from lagros_benchmarks.run.library import SetupError, Toolbox
+from lagros_benchmarks.run.runner import fly_scene, kept_in, run_benchmark
+from lagros_benchmarks.run.settings import BenchmarkSettings
 from tests.benchmarks import fakes, spacecraft_fakes
 
 

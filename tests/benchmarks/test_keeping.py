@@ -16,14 +16,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from lagros_benchmarks import cli
-from lagros_benchmarks.cartpole_experiment import CartPoleExperiment
-from lagros_benchmarks.fingerprints import fingerprint
-from lagros_benchmarks.keeping import Kept, decode, encode
-from lagros_benchmarks.library import Toolbox
-from lagros_benchmarks.runner import kept_in, run_benchmark
-from lagros_benchmarks.settings import BenchmarkSettings
-from lagros_benchmarks.spacecraft_episodes import AgentRecord, Flight
+from lagros_benchmarks.commands import cli
+from lagros_benchmarks.run.fingerprints import fingerprint
+from lagros_benchmarks.run.keeping import Kept, decode, encode
+from lagros_benchmarks.run.library import Toolbox
+from lagros_benchmarks.run.runner import kept_in, run_benchmark
+from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_benchmarks.tasks.cartpole.experiment import CartPoleExperiment
+from lagros_benchmarks.tasks.spacecraft.episodes import AgentRecord, Flight
 from tests.benchmarks import fakes, killed_runs
 
 TIMES = ("timed_counters", "step_times", "deadline_misses", "steps", "batches", "plans")
@@ -278,7 +278,7 @@ def test_the_key_changes_with_all_that_a_result_depends_on(tmp_path, monkeypatch
         different.append(key())
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     different.append(key())
-    monkeypatch.setattr("lagros_benchmarks.fingerprints.versions", lambda: {"numpy": "0"})
+    monkeypatch.setattr("lagros_benchmarks.run.fingerprints.versions", lambda: {"numpy": "0"})
     different.append(key())
     assert len({first, *different}) == 1 + len(different)
     assert key(jobs=2) == key(jobs=3)
@@ -290,8 +290,8 @@ def test_the_key_changes_with_all_that_a_result_depends_on(tmp_path, monkeypatch
 @pytest.fixture
 def bench(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("lagros_benchmarks.runner.Toolbox", lambda: fakes.EASY)
-    monkeypatch.setattr("lagros_benchmarks.settings.check_policy", lambda *_: None)
+    monkeypatch.setattr("lagros_benchmarks.run.runner.Toolbox", lambda: fakes.EASY)
+    monkeypatch.setattr("lagros_benchmarks.run.settings.check_policy", lambda *_: None)
     arguments = ("bench", "cartpole", "--policies", "steady,idle", "--episodes", "3")
     return lambda *more: CliRunner().invoke(cli.app, (*arguments, *more))
 

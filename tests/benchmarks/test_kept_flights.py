@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from studies import conformal, worst_case
 
-from lagros_benchmarks import calibration
-from lagros_benchmarks.calibration import EpisodeScores, pretrained_hash
+from lagros_benchmarks.evidence import calibration
+from lagros_benchmarks.evidence.calibration import EpisodeScores, pretrained_hash
 from lagros_benchmarks.worst_case.attack import AttackSettings
 
 FILES = ("cartpole_lagros.safetensors", "cartpole_metric.json", "spacecraft_lagros.safetensors")

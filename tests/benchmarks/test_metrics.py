@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from lagros_benchmarks.metrics import (
+from lagros_benchmarks.run.metrics import (
     carry_forward,
     cluster_interval,
     cluster_rate_interval,

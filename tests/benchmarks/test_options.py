@@ -16,7 +16,7 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from lagros_benchmarks import cli
+from lagros_benchmarks.commands import cli
 
 LONG = "x" * 100_000
 NAMES = ("", "nonsense", "None", "ünï🚀", "a b", "-", "--", LONG, "a\0b", "a\nb", "../x")
@@ -271,7 +271,7 @@ def invoke(tmp_path, monkeypatch):
         "export._written",
     ):
         monkeypatch.setattr(f"lagros_benchmarks.{place}", begin)
-    monkeypatch.setattr("lagros_policies.imitation.demonstrations.demonstrate", begin)
+    monkeypatch.setattr("lagros_policies.learning.demonstrations.demonstrate", begin)
     monkeypatch.setenv("COLUMNS", "500")
     # Building the commands takes nine tenths of a call that refuses.
     monkeypatch.setattr("typer.testing._get_command", lambda _: COMMAND)

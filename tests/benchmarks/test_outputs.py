@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from lagros_benchmarks import canvas, figures, files, formats, tables
-from lagros_benchmarks.records import summarise
-from lagros_benchmarks.runner import run_benchmark
-from lagros_benchmarks.settings import BenchmarkSettings
+from lagros_benchmarks.report import canvas, figures, formats, tables
+from lagros_benchmarks.report.records import summarise
+from lagros_benchmarks.run import files
+from lagros_benchmarks.run.runner import run_benchmark
+from lagros_benchmarks.run.settings import BenchmarkSettings
 from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
 from tests.benchmarks import fakes
 

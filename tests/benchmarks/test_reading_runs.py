@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from lagros_benchmarks import cli
-from lagros_benchmarks.certify_evidence import load_axis_metric
-from lagros_benchmarks.files import plain
+from lagros_benchmarks.commands import cli
+from lagros_benchmarks.evidence.evidence import load_axis_metric
+from lagros_benchmarks.run.files import plain
 from lagros_benchmarks.training.run import Place, train
 from lagros_benchmarks.training.settings import CartPoleTraining
 from lagros_benchmarks.worst_case import attack
@@ -26,7 +26,7 @@ from lagros_benchmarks.worst_case.replay import (
     save_worst_cases,
 )
 from lagros_benchmarks.worst_case.search import SearchSettings
-from lagros_policies.imitation.shards import claim, make_shards
+from lagros_policies.learning.shards import claim, make_shards
 
 FUZZ = settings(
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from lagros_benchmarks import cli
-from lagros_benchmarks.extras import MODULES
+from lagros_benchmarks.commands import cli
+from lagros_benchmarks.commands.extras import MODULES
 from tests import documents, first_half
 
 README = Path(__file__).parents[2] / "README.md"

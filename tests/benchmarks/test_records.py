@@ -9,10 +9,10 @@ import math
 import numpy as np
 import pytest
 
-from lagros_benchmarks.files import json_lines_text, plain, write_atomic, write_json
-from lagros_benchmarks.records import episode_objects, summarise
-from lagros_benchmarks.runner import Case, run_benchmark
-from lagros_benchmarks.settings import BenchmarkSettings
+from lagros_benchmarks.report.records import episode_objects, summarise
+from lagros_benchmarks.run.files import json_lines_text, plain, write_atomic, write_json
+from lagros_benchmarks.run.runner import Case, run_benchmark
+from lagros_benchmarks.run.settings import BenchmarkSettings
 from tests.benchmarks import fakes
 
 # What a row of results is made of; a name that goes breaks who reads the JSON.

@@ -12,20 +12,20 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from lagros_benchmarks import cli
-from lagros_benchmarks.outputs import Delivery, check_outputs
+from lagros_benchmarks.commands import cli
+from lagros_benchmarks.commands.outputs import Delivery, check_outputs
 
 # What a command does, none of which may begin.
 WORK = (
-    "lagros_benchmarks.runner.run_benchmark",
-    "lagros_benchmarks.reproduction.reproduce",
+    "lagros_benchmarks.run.runner.run_benchmark",
+    "lagros_benchmarks.run.reproduction.reproduce",
     "lagros_benchmarks.worst_case.attack.run_attack",
-    "lagros_benchmarks.certify.certify_cartpole",
-    "lagros_benchmarks.certify.certify_spacecraft",
-    "lagros_benchmarks.train._train_one",
-    "lagros_benchmarks.export._written",
-    "lagros_benchmarks.playback.Playback.play",
-    "lagros_policies.imitation.demonstrations.demonstrate",
+    "lagros_benchmarks.commands.certify.certify_cartpole",
+    "lagros_benchmarks.commands.certify.certify_spacecraft",
+    "lagros_benchmarks.commands.train._train_one",
+    "lagros_benchmarks.commands.export._written",
+    "lagros_benchmarks.report.playback.Playback.play",
+    "lagros_policies.learning.demonstrations.demonstrate",
 )
 START = {
     "bench": "bench spacecraft --policies learned --episodes 1",

@@ -7,21 +7,21 @@ import filecmp
 import numpy as np
 import pytest
 
-from lagros_benchmarks.reproduce import ReproduceSettings
-from lagros_benchmarks.reproduce_spacecraft import (
+from lagros_benchmarks.run.reproduction import reproduce
+from lagros_benchmarks.run.runner import run_benchmark
+from lagros_benchmarks.tasks.cartpole.reproduce import ReproduceSettings
+from lagros_benchmarks.tasks.spacecraft.reproduce import (
     SpacecraftReproduceSettings,
     training_part,
 )
-from lagros_benchmarks.reproduction import reproduce
-from lagros_benchmarks.runner import run_benchmark
-from lagros_envs.observation import Layout
-from lagros_policies.imitation.dataset import ExpertDataSettings
-from lagros_policies.imitation.network_policy import PRETRAINED
-from lagros_policies.imitation.networks import Mlp
-from lagros_policies.imitation.spacecraft_flights import FlightData, FlightSettings
-from lagros_policies.imitation.train import TrainingSettings
-from lagros_policies.imitation.train_deep_set import DeepSetTraining
-from lagros_policies.metric_design import MetricDesignSettings
+from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_policies.learning.dataset import ExpertDataSettings
+from lagros_policies.learning.network_policy import PRETRAINED
+from lagros_policies.learning.networks import Mlp
+from lagros_policies.learning.train import TrainingSettings
+from lagros_policies.learning.train_deep_set import DeepSetTraining
+from lagros_policies.tasks.cartpole.metric_design import MetricDesignSettings
+from lagros_policies.tasks.spacecraft.flights import FlightData, FlightSettings
 
 FILES = (
     "metric.json",

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from studies.rollouts import fly, measures, plan_episodes
 
-from lagros_envs.cartpole_vector import CartPoleVectorEnv
 from lagros_envs.dynamics import CartPole
+from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
 from lagros_policies.baselines import LqrPolicy
-from lagros_policies.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 
 def test_flights_and_measures_are_those_of_the_environment():

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lagros_benchmarks.cartpole_experiment import plan_nominals
-from lagros_benchmarks.library import SetupError
-from lagros_benchmarks.runner import Case, run_benchmark
-from lagros_benchmarks.settings import BenchmarkSettings, Condition
+from lagros_benchmarks.run.library import SetupError
+from lagros_benchmarks.run.runner import Case, run_benchmark
+from lagros_benchmarks.run.settings import BenchmarkSettings, Condition
+from lagros_benchmarks.tasks.cartpole.experiment import plan_nominals
 from tests.benchmarks import fakes
 
 UNIFORM = Condition("uniform", 0.75)

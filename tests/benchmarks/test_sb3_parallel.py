@@ -14,12 +14,12 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from lagros_benchmarks.sb3_parallel import ParallelVecEnv
-from lagros_benchmarks.sb3_vector import SB3VectorEnv
+from lagros_benchmarks.training.sb3_parallel import ParallelVecEnv
+from lagros_benchmarks.training.sb3_vector import SB3VectorEnv
 from lagros_envs import spacecraft_v0
-from lagros_envs.cartpole import CartPoleEnv
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 
 AGENTS, WORLDS = 3, 4
 SHORT = SpacecraftSettings(time_limit=1.5)

@@ -6,10 +6,10 @@ from stable_baselines3 import A2C
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from lagros_benchmarks.sb3_vector import LinearFeatures, SB3VectorEnv
-from lagros_envs.cartpole import CartPoleEnv
-from lagros_envs.cartpole_task import CartPoleSettings
-from lagros_envs.cartpole_vector import CartPoleVectorEnv
+from lagros_benchmarks.training.sb3_vector import LinearFeatures, SB3VectorEnv
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
 from lagros_policies.actor import goal_frame
 from lagros_policies.baselines import LqrPolicy
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import lagros_policies
-from lagros_benchmarks.settings import BenchmarkSettings, check_policy
+from lagros_benchmarks.run.settings import BenchmarkSettings, check_policy
 from lagros_envs.seeding import EVALUATION, episode_seeds
 from lagros_policies.policy import SPACECRAFT_NAMES
 

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from lagros_benchmarks.spacecraft_episodes import Trace, fly, fly_chunk, plans_of
+from lagros_benchmarks.tasks.spacecraft.episodes import Trace, fly, fly_chunk, plans_of
 from lagros_envs import spacecraft_v0
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from tests.benchmarks import spacecraft_fakes as fakes
 
 SEEDS = [3, 14, 15, 92, 65]

@@ -18,15 +18,18 @@ from rich.console import Console
 from rich.text import Text
 from typer.testing import CliRunner
 
-from lagros_benchmarks import cli, figures, files, formats, spacecraft_figures, tables
-from lagros_benchmarks.canvas import save
-from lagros_benchmarks.formats import percent
-from lagros_benchmarks.records import summarise
-from lagros_benchmarks.runner import fly_scene, run_benchmark
-from lagros_benchmarks.scene_figure import scene_figure
-from lagros_benchmarks.settings import BenchmarkSettings
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_benchmarks.commands import cli
+from lagros_benchmarks.report import figures, formats, tables
+from lagros_benchmarks.report.canvas import save
+from lagros_benchmarks.report.formats import percent
+from lagros_benchmarks.report.records import summarise
+from lagros_benchmarks.run import files
+from lagros_benchmarks.run.runner import fly_scene, run_benchmark
+from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_benchmarks.tasks.spacecraft import figures as spacecraft_figures
+from lagros_benchmarks.tasks.spacecraft.scene_figure import scene_figure
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from tests.benchmarks import spacecraft_fakes as fakes
 
 WIDTH = 80
@@ -47,7 +50,7 @@ def short_episodes():
     """A fifth of the time is enough for what is printed and drawn."""
     short = functools.partial(SpacecraftVectorEnv, settings=SpacecraftSettings(time_limit=9.0))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lagros_benchmarks.spacecraft_experiment.SpacecraftVectorEnv", short)
+        patch.setattr("lagros_benchmarks.tasks.spacecraft.experiment.SpacecraftVectorEnv", short)
         yield
 
 
@@ -256,7 +259,7 @@ def test_the_scene_is_drawn(tmp_path, monkeypatch):
         titles.extend(axes.get_title("left") for axes in figure.axes if axes.axison)
         return save(figure, path)
 
-    monkeypatch.setattr("lagros_benchmarks.scene_figure.write", write)
+    monkeypatch.setattr("lagros_benchmarks.tasks.spacecraft.scene_figure.write", write)
     settings = BenchmarkSettings.for_task(
         "spacecraft",
         policies=("lagros", "centralized", "learned"),
@@ -281,7 +284,7 @@ def test_the_scene_is_drawn(tmp_path, monkeypatch):
 @pytest.fixture
 def invoke(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("lagros_benchmarks.runner.Toolbox", lambda: TOOLBOX)
+    monkeypatch.setattr("lagros_benchmarks.run.runner.Toolbox", lambda: TOOLBOX)
     return lambda *arguments: CliRunner().invoke(cli.app, arguments)
 
 

@@ -9,14 +9,14 @@ import math
 import numpy as np
 import pytest
 
-from lagros_benchmarks.files import json_lines_text, write_atomic, write_json
-from lagros_benchmarks.metrics import wilson_interval
-from lagros_benchmarks.records import episode_objects, summarise
-from lagros_benchmarks.runner import Case, run_benchmark
-from lagros_benchmarks.settings import BenchmarkSettings, Condition
-from lagros_benchmarks.spacecraft_episodes import AgentRecord, WorldRecord
-from lagros_benchmarks.spacecraft_experiment import SpacecraftRun
-from lagros_benchmarks.spacecraft_timing import Timing
+from lagros_benchmarks.report.records import episode_objects, summarise
+from lagros_benchmarks.run.files import json_lines_text, write_atomic, write_json
+from lagros_benchmarks.run.metrics import wilson_interval
+from lagros_benchmarks.run.runner import Case, run_benchmark
+from lagros_benchmarks.run.settings import BenchmarkSettings, Condition
+from lagros_benchmarks.tasks.spacecraft.episodes import AgentRecord, WorldRecord
+from lagros_benchmarks.tasks.spacecraft.experiment import SpacecraftRun
+from lagros_benchmarks.tasks.spacecraft.timing import Timing
 from tests.benchmarks import spacecraft_fakes as fakes
 
 # What a row of results is made of; a name that goes breaks who reads the JSON.

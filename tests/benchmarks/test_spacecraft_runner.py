@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lagros_benchmarks.library import SetupError
-from lagros_benchmarks.runner import Case, fly_scene, run_benchmark
-from lagros_benchmarks.settings import BenchmarkSettings, Condition
-from lagros_benchmarks.spacecraft_experiment import SpacecraftExperiment
-from lagros_benchmarks.spacecraft_timing import time_policy
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_benchmarks.run.library import SetupError
+from lagros_benchmarks.run.runner import Case, fly_scene, run_benchmark
+from lagros_benchmarks.run.settings import BenchmarkSettings, Condition
+from lagros_benchmarks.tasks.spacecraft.experiment import SpacecraftExperiment
+from lagros_benchmarks.tasks.spacecraft.timing import time_policy
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from tests.benchmarks import spacecraft_fakes as fakes
 
 

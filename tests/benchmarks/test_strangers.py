@@ -12,13 +12,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from lagros_benchmarks import cli
-from lagros_benchmarks.calibration import cartpole_scores
-from lagros_benchmarks.flying import AnswerError, Attempt, ask, describe_error
-from lagros_benchmarks.runner import run_benchmark
-from lagros_benchmarks.settings import BenchmarkSettings
-from lagros_benchmarks.worst_case.cartpole import GOALS, draw_episodes, fly, policy_law, scores
-from lagros_policies.expert import CartPoleExpert
+from lagros_benchmarks.commands import cli
+from lagros_benchmarks.evidence.calibration import cartpole_scores
+from lagros_benchmarks.run.flying import AnswerError, Attempt, ask, describe_error
+from lagros_benchmarks.run.runner import run_benchmark
+from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_benchmarks.tasks.cartpole.worst_case import (
+    GOALS,
+    draw_episodes,
+    fly,
+    policy_law,
+    scores,
+)
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 from tests.benchmarks import strangers
 
 PLACE = "tests.benchmarks.strangers"
@@ -161,7 +167,7 @@ def process_state():
 def test_a_command_ends_though_a_thread_does_not():
     program = """
 import threading, time
-from lagros_benchmarks import process
+from lagros_benchmarks.run import process
 process._PATIENCE = 0.1
 threading.Thread(target=time.sleep, args=(600,)).start()
 process.end_with_threads(3)

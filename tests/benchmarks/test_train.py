@@ -18,12 +18,12 @@ pytest.importorskip("stable_baselines3")
 
 from stable_baselines3.common.vec_env import VecNormalize
 
-from lagros_benchmarks.sb3_vector import SB3VectorEnv
-from lagros_benchmarks.settings import BenchmarkSettings
-from lagros_benchmarks.training import cartpole
+from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_benchmarks.tasks.cartpole import training as cartpole
 from lagros_benchmarks.training.agent import make_agent
 from lagros_benchmarks.training.lessons import lesson_of
 from lagros_benchmarks.training.run import Place, train
+from lagros_benchmarks.training.sb3_vector import SB3VectorEnv
 from lagros_benchmarks.training.settings import (
     CURVE,
     DEFAULTS,
@@ -31,12 +31,12 @@ from lagros_benchmarks.training.settings import (
     OffPolicy,
     default_training,
 )
-from lagros_envs.cartpole_task import CartPoleSettings
-from lagros_envs.cartpole_vector import CartPoleVectorEnv
 from lagros_envs.seeding import EVALUATION, episode_seeds
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
 from lagros_policies.actor import Actor, ActorPolicy
-from lagros_policies.imitation.networks import Mlp
 from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.learning.networks import Mlp
 from lagros_policies.residual import ResidualPolicy
 from tests.benchmarks.tiny_training import ALGORITHMS, TINY, one_thread
 
@@ -359,7 +359,8 @@ def test_events_hold_the_curve_once_also_after_a_kill(tmp_path, monkeypatch):
 def test_a_process_that_is_killed_for_good_goes_on(tmp_path):
     program = (
         "import sys; sys.argv = ['lagros', 'train', 'cartpole', '--algo', 'td3', "
-        "'--segments', '3', '--out', sys.argv[1]]; from lagros_benchmarks.cli import app; app()"
+        "'--segments', '3', '--out', sys.argv[1]]; "
+        "from lagros_benchmarks.commands.cli import app; app()"
     )
 
     def start(folder):

@@ -16,15 +16,15 @@ pytest.importorskip("stable_baselines3")
 from rich.console import Console
 from typer.testing import CliRunner
 
-from lagros_benchmarks import canvas
-from lagros_benchmarks import train as command
-from lagros_benchmarks.cli import app
+from lagros_benchmarks.commands import train as command
+from lagros_benchmarks.commands.cli import app
+from lagros_benchmarks.report import canvas
 from lagros_benchmarks.training import curves as curves_module
 from lagros_benchmarks.training.curves import curves_of, draw, range_confidence
 from lagros_benchmarks.training.lessons import lesson_of
 from lagros_benchmarks.training.settings import DEFAULTS, SpacecraftTraining, Training
 from lagros_benchmarks.training.table import final_table
-from lagros_envs.cartpole import CartPoleEnv
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
 from lagros_policies.policy import make
 from tests.benchmarks.tiny_training import ALGORITHMS, TINY, one_thread
 

@@ -10,10 +10,10 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 
-from lagros_benchmarks.sb3_vector import SB3VectorEnv
-from lagros_benchmarks.training import spacecraft as training
+from lagros_benchmarks.tasks.spacecraft import training
 from lagros_benchmarks.training.agent import actor_network, make_agent
 from lagros_benchmarks.training.run import Place, train
+from lagros_benchmarks.training.sb3_vector import SB3VectorEnv
 from lagros_benchmarks.training.settings import (
     CURVE,
     FINAL,
@@ -22,13 +22,19 @@ from lagros_benchmarks.training.settings import (
     default_training,
 )
 from lagros_envs import spacecraft_v0
-from lagros_envs.observation import Layout
-from lagros_envs.scenarios import Preset, Scenario
 from lagros_envs.seeding import episode_seeds
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
-from lagros_policies.imitation.networks import Mlp
-from lagros_policies.spacecraft_ppo import FEATURES, WEIGHTS, SpacecraftPpoPolicy, look, thrust_of
+from lagros_envs.tasks.spacecraft.scenarios import Preset, Scenario
+from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+from lagros_policies.learning.networks import Mlp
+from lagros_policies.tasks.spacecraft.ppo import (
+    FEATURES,
+    WEIGHTS,
+    SpacecraftPpoPolicy,
+    look,
+    thrust_of,
+)
 
 TINY = SpacecraftTraining(
     Ppo(rollout_steps=30, batch_size=60, epochs=2),

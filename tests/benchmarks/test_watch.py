@@ -14,12 +14,13 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from lagros_benchmarks import cli, video, watched
-from lagros_benchmarks.pictures import CartPolePictures
-from lagros_benchmarks.playback import Playback, WatchSettings
+from lagros_benchmarks.commands import cli
+from lagros_benchmarks.report import video, watched
+from lagros_benchmarks.report.pictures import CartPolePictures
+from lagros_benchmarks.report.playback import Playback, WatchSettings
 from lagros_envs import spacecraft_v0
-from lagros_envs.cartpole_task import CartPoleSettings
-from lagros_envs.scenarios import Scenario
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_policies.baselines import LqrPolicy
 
 pygame = pytest.importorskip("pygame")
@@ -27,7 +28,7 @@ pygame = pytest.importorskip("pygame")
 PILOTS = '''
 import numpy as np
 
-from lagros_envs.observation import Layout
+from lagros_envs.tasks.spacecraft.sensing import Layout
 
 
 class Pilot:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401
-from lagros_benchmarks.worst_case import cartpole
+from lagros_benchmarks.tasks.cartpole import worst_case as cartpole
 from lagros_benchmarks.worst_case.attack import AttackSettings, fly_again, run_attack
 from lagros_benchmarks.worst_case.certificate import TubeCheck
 from lagros_benchmarks.worst_case.optimisers import OPTIMISERS, make_search
@@ -25,11 +25,11 @@ from lagros_benchmarks.worst_case.replay import (
 )
 from lagros_benchmarks.worst_case.search import METHODS, SearchSettings, search
 from lagros_benchmarks.worst_case.sequences import PARAMETRISATIONS, Knots, Replay, Segments
-from lagros_envs.cartpole_vector import CartPoleVectorEnv
 from lagros_envs.seeding import episode_seeds
+from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
 from lagros_policies.baselines import LqrPolicy
-from lagros_policies.expert import CartPoleExpert
 from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
 FloatArray = NDArray[np.float64]

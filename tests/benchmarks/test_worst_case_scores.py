@@ -13,23 +13,24 @@ from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401
 import lagros_policies
-from lagros_benchmarks import calibration
-from lagros_benchmarks.worst_case import attack, cartpole
+from lagros_benchmarks.evidence import calibration
+from lagros_benchmarks.tasks.cartpole import worst_case as cartpole
+from lagros_benchmarks.tasks.spacecraft.plane import plane_target, worst_plane_pushes
+from lagros_benchmarks.tasks.spacecraft.worst_case import SpacecraftFlights, SpacecraftTarget
+from lagros_benchmarks.worst_case import attack
 from lagros_benchmarks.worst_case.attack import AttackSettings, check_bound, run_attack
 from lagros_benchmarks.worst_case.certificate import CertificateTarget, TubeCheck
-from lagros_benchmarks.worst_case.plane import plane_target, worst_plane_pushes
 from lagros_benchmarks.worst_case.replay import Outcome, replay_cartpole, replay_spacecraft
 from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_benchmarks.worst_case.seeds import ATTACK, CALIBRATION
-from lagros_benchmarks.worst_case.spacecraft import SpacecraftFlights, SpacecraftTarget
 from lagros_envs.conventions import beyond_the_end
 from lagros_envs.seeding import EVALUATION, episode_seeds
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.baselines import LqrPolicy
 from lagros_policies.contraction import certified_tube
-from lagros_policies.contraction.lagrangian import SlidingAxis, SlidingTracking, peak_position_error
-from lagros_policies.expert import CartPoleExpert
-from lagros_policies.safety import SafetyFilter
+from lagros_policies.remarks.lagrangian import SlidingAxis, SlidingTracking, peak_position_error
+from lagros_policies.safety.filter import SafetyFilter
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 FloatArray = NDArray[np.float64]
 
@@ -154,7 +155,7 @@ def test_a_search_for_the_share_of_the_certificate_is_no_worse_than_its_starts(
 
 
 def test_a_metric_that_is_a_network_is_attacked_by_the_law_of_its_own() -> None:
-    name = "lagros_policies.options:NeuralTubeMpcPolicy"
+    name = "lagros_policies.remarks.policies:NeuralTubeMpcPolicy"
     given = AttackSettings(policy=name, bound=0.3, episodes=1, search=SearchSettings(budget=30))
     row = run_attack(given).row
     assert row["broken_rate"] == 1.0

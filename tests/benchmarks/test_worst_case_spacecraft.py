@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 import lagros_policies
-from lagros_benchmarks import calibration
-from lagros_benchmarks.worst_case.replay import replay_spacecraft
-from lagros_benchmarks.worst_case.seeds import ATTACK, CALIBRATION, VERIFICATION
-from lagros_benchmarks.worst_case.spacecraft import (
+from lagros_benchmarks.evidence import calibration
+from lagros_benchmarks.tasks.spacecraft.worst_case import (
     PARAMETERS,
     Adversary,
     PlansOnce,
@@ -19,10 +17,12 @@ from lagros_benchmarks.worst_case.spacecraft import (
     first_adversaries,
     least_gap,
 )
+from lagros_benchmarks.worst_case.replay import replay_spacecraft
+from lagros_benchmarks.worst_case.seeds import ATTACK, CALIBRATION, VERIFICATION
 from lagros_envs.disturbances import Situation
-from lagros_envs.scenarios import Scenario
 from lagros_envs.seeding import EVALUATION, episode_seeds
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_envs.tasks.spacecraft.scenarios import Scenario
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.conformal import rank_for
 
 AGENTS = 2
@@ -150,8 +150,8 @@ def test_statements_need_enough_episodes_for_the_level() -> None:
 
 
 def test_scores_of_the_spacecraft_stay_below_the_certified_margin() -> None:
-    from lagros_policies.centralized import CentralizedPolicy
     from lagros_policies.contraction.double_integrator import certified_margin
+    from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
 
     scores = calibration.spacecraft_scores(3, bound=0.4, preset="open", agents=2)
     margin = certified_margin(CentralizedPolicy(preset="open").tracking.plane, 0.4)

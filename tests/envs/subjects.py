@@ -11,10 +11,10 @@ import numpy as np
 
 import lagros_envs  # noqa: F401 - registers the ids
 from lagros_envs import spacecraft_v0
-from lagros_envs.cartpole import CartPoleEnv
-from lagros_envs.cartpole_vector import CartPoleVectorEnv
-from lagros_envs.spacecraft_single import SpacecraftEnv
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
+from lagros_envs.tasks.spacecraft.single import SpacecraftEnv
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 
 CARTPOLE, SPACECRAFT = "lagros/CartPole-v0", "lagros/Spacecraft-v0"
 IDS = (CARTPOLE, SPACECRAFT)

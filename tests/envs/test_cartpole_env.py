@@ -8,10 +8,10 @@ import pytest
 from gymnasium import spaces
 
 import lagros_envs  # noqa: F401 - registers the ids
-from lagros_envs.cartpole import CartPoleEnv
-from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.disturbances import KINDS, OPEN_LOOP
 from lagros_envs.dynamics import CartPole, hold_step
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tube import PaperTube
 
 METRIC = np.diag([1.0, 8.0, 0.5, 2.0])
@@ -45,7 +45,7 @@ def test_importing_and_making_imports_no_heavy_library(run_python):
         "envs = gymnasium.make_vec('lagros/CartPole-v0', num_envs=3, compiled=False)\n"
         "envs.reset(seed=0); envs.step(envs.action_space.sample())\n"
         "heavy = {'torch', 'pygame', 'scipy', 'cvxpy', 'matplotlib', 'stable_baselines3'}\n"
-        "print(sorted(heavy & set(sys.modules)), 'lagros_envs.rendering' in sys.modules)"
+        "print(sorted(heavy & set(sys.modules)), 'lagros_envs.tasks.cartpole.draw' in sys.modules)"
     )
     assert printed == "[] False\n"
 

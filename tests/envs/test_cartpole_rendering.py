@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import lagros_envs  # noqa: F401 - registers the ids
-from lagros_envs.cartpole import CartPoleEnv
-from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.dynamics import CartPole
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 
 pygame_only = pytest.mark.skipif(
     not importlib.util.find_spec("pygame"), reason="the extra render is missing"

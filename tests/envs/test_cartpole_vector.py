@@ -8,11 +8,11 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import lagros_envs  # noqa: F401 - registers the ids
-from lagros_envs.cartpole import CartPoleEnv
-from lagros_envs.cartpole_task import CartPoleSettings
-from lagros_envs.cartpole_vector import CartPoleVectorEnv
 from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.seeding import episode_seeds
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
 
 SEEDS = [11, 0, 2**62, 7, 123456789, 3]
 WORLDS = len(SEEDS)

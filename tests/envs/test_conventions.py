@@ -11,9 +11,9 @@ from gymnasium import spaces
 from gymnasium.wrappers import RescaleObservation, TimeAwareObservation
 
 from lagros_envs import conventions
-from lagros_envs.cartpole_task import CartPoleSettings
-from lagros_envs.scenarios import PRESETS
-from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from tests.envs.subjects import CARTPOLE, EVERY, IDS, PETTINGZOO, SHORT, SINGLE, SPACECRAFT, VECTOR
 
 # What is asked before a step is the same in every mode of autoreset.

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 
-from lagros_envs import scenarios
-from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.conventions import settings_of
 from lagros_envs.dynamics import CartPole, Spacecraft
-from lagros_envs.scenarios import PRESETS
-from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.spacecraft import scenarios
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tube import PaperTube
 from tests.envs.subjects import CARTPOLE, EVERY, IDS, PETTINGZOO, SHORT, SINGLE, SPACECRAFT, VECTOR
 

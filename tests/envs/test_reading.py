@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from lagros_envs import reading
 from lagros_envs.reading import Record, read_bytes, read_json, read_npz
-from lagros_envs.scenarios import Scenario, preset_named
+from lagros_envs.tasks.spacecraft.scenarios import Scenario, preset_named
 
 # pickles what is read, if anything unpickles it.
 BOMB = b"cos\nsystem\n(S'touch pwned'\ntR."

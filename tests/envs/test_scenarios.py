@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lagros_envs.placement import most_apart
-from lagros_envs.reachable import flood, way_exists
-from lagros_envs.scenarios import PRESETS, Preset, Scenario, preset_named
 from lagros_envs.seeding import episode_streams
+from lagros_envs.tasks.spacecraft.placement import most_apart
+from lagros_envs.tasks.spacecraft.reachable import flood, way_exists
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Preset, Scenario, preset_named
 
 
 def drawn(preset, agents=None, seeds=range(25)):

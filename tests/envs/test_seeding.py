@@ -8,7 +8,6 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lagros_envs.cartpole import CartPoleEnv
 from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.seeding import (
     EVALUATION,
@@ -17,6 +16,7 @@ from lagros_envs.seeding import (
     episode_streams,
     seeded_streams,
 )
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
 
 seeds = st.integers(0, 2**63 - 1)
 

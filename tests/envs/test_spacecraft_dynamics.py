@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lagros_envs.dynamics import control_matrix, hold_step, jacobian, vector_field
-from lagros_envs.dynamics.spacecraft import Spacecraft
-from lagros_envs.spacecraft_world import SUBSTEPS
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
+from lagros_envs.tasks.spacecraft.world import SUBSTEPS
 
 # Not the defaults, and all different, so that no two parameters can be mistaken for each other.
 ODD = Spacecraft(mass=1.7, inertia=0.6, arm=0.83, side_arm=0.37)

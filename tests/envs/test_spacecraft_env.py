@@ -20,9 +20,9 @@ from pettingzoo.test import (
 
 import lagros_envs  # noqa: F401 - registers the ids
 from lagros_envs import spacecraft_v0
-from lagros_envs.scenarios import PRESETS, Scenario
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Scenario
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 
 METRIC = np.diag([2.0, 2.0, 1.0, 3.0, 3.0, 1.0])
 STILL = np.zeros(8, np.float32)

@@ -7,11 +7,11 @@ import pytest
 from gymnasium import spaces
 
 from lagros_envs.disturbances import Disturbance
-from lagros_envs.observation import Layout, global_state, named_state_space, observe
-from lagros_envs.scenarios import PRESETS, Scenario
 from lagros_envs.seeding import episode_streams
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_envs.spacecraft_world import SpacecraftWorld
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Scenario
+from lagros_envs.tasks.spacecraft.sensing import Layout, global_state, named_state_space, observe
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.world import SpacecraftWorld
 
 
 def world_of(*scenarios, obstacles=6, steps=0, **settings):

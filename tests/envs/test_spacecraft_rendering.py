@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from lagros_envs import spacecraft_v0
-from lagros_envs.scenarios import Scenario
+from lagros_envs.tasks.spacecraft.scenarios import Scenario
 
 pygame = pytest.importorskip("pygame")
 
 from lagros_envs.canvas import BLUE, VERMILLION  # noqa: E402
-from lagros_envs.spacecraft_rendering import BORDER, PANEL, VIEW  # noqa: E402
+from lagros_envs.tasks.spacecraft.draw import BORDER, PANEL, VIEW  # noqa: E402
 
 STILL = np.zeros(8)
 SIDE = 5.0 + 2.0 * BORDER  # of the view of an arena of 5 m [m]

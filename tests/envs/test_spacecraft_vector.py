@@ -8,8 +8,8 @@ import pytest
 
 import lagros_envs  # noqa: F401 - registers the ids
 from lagros_envs import spacecraft_v0
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 
 SHORT = SpacecraftSettings(time_limit=1.0)
 METRIC = np.diag([2.0, 2.0, 1.0, 3.0, 3.0, 1.0])

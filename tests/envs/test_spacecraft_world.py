@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from lagros_envs.disturbances import OPEN_LOOP, Disturbance
 from lagros_envs.dynamics import control_matrix, hold_step
-from lagros_envs.dynamics.spacecraft import Spacecraft
-from lagros_envs.scenarios import PRESETS, Scenario
 from lagros_envs.seeding import episode_streams
-from lagros_envs.spacecraft_task import SpacecraftSettings, applied_forces
-from lagros_envs.spacecraft_world import SUBSTEPS, SpacecraftWorld
 from lagros_envs.sweep import Path, closest_approach, swept_agents, swept_obstacles
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Scenario
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings, applied_forces
+from lagros_envs.tasks.spacecraft.world import SUBSTEPS, SpacecraftWorld
 
 ALL = (True,) * 6
 NONE = Disturbance("none", 0.0, ALL)

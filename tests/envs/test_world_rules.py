@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import lagros_envs  # noqa: F401  registers the environment
-from lagros_envs.cartpole_task import CartPoleSettings, StepRules
 from lagros_envs.dynamics.held import HeldBatch
-from lagros_envs.scenarios import Scenario
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
 from lagros_envs.sweep import Path, swept_agents
+from lagros_envs.tasks.cartpole.task import CartPoleSettings, StepRules
+from lagros_envs.tasks.spacecraft.scenarios import Scenario
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 
 FAR = Scenario([[0.0, 0.0], [0.0, 4.0]], [0.0, 0.0], [[4.0, 0.0], [4.0, 4.0]], [], [])
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lagros_envs import cartpole_task as task
 from lagros_envs.dynamics import CartPole
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction import CvStemSettings, Region, Samples, design_on_pool
-from lagros_policies.imitation.networks import Mlp
+from lagros_policies.learning.networks import Mlp
 from lagros_policies.planning import CartPolePlanner
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -9,12 +9,12 @@ import torch
 from stable_baselines3 import A2C, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
-from lagros_benchmarks.sb3_vector import LinearFeatures, SB3VectorEnv
-from lagros_benchmarks.training.cartpole import evaluate, extract_actor
-from lagros_envs.cartpole import CartPoleEnv
-from lagros_envs.cartpole_task import CartPoleSettings
-from lagros_envs.cartpole_vector import CartPoleVectorEnv
+from lagros_benchmarks.tasks.cartpole.training import evaluate, extract_actor
+from lagros_benchmarks.training.sb3_vector import LinearFeatures, SB3VectorEnv
 from lagros_envs.seeding import episode_seeds
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
 from lagros_policies.actor import (
     PRETRAINED,
     Actor,
@@ -24,8 +24,8 @@ from lagros_policies.actor import (
     Td3Policy,
     goal_frame,
 )
-from lagros_policies.imitation.networks import Mlp, read_safetensors, write_safetensors
 from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.learning.networks import Mlp, read_safetensors, write_safetensors
 from lagros_policies.residual import ResidualPolicy
 
 TANH = {"net_arch": [16, 8], "activation_fn": torch.nn.Tanh}

@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lagros_envs import cartpole_task as task
 from lagros_envs.dynamics import CartPole, hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction import HeldControl, load_metric
-from lagros_policies.contraction.adaptive import (
+from lagros_policies.contraction.control import error_energy
+from lagros_policies.planning import CartPolePlanner
+from lagros_policies.remarks.adaptive import (
     AdaptiveControl,
     cart_mass_regressor,
     friction_regressor,
     largest_gain,
     slope_regressor,
 )
-from lagros_policies.contraction.control import error_energy
-from lagros_policies.planning import CartPolePlanner
 
 PERIOD, MODEL = 0.1, CartPole()
 

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lagros_envs.scenarios import Scenario
+from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_policies import make
 from lagros_policies.actor import Actor
 from lagros_policies.contraction import load_metric
-from lagros_policies.contraction.neural.metric import load_neural_metric
-from lagros_policies.imitation.deep_set import DeepSet
-from lagros_policies.imitation.networks import Mlp
+from lagros_policies.learning.deep_set import DeepSet
+from lagros_policies.learning.networks import Mlp
 from lagros_policies.policy import _CARTPOLE, _SPACECRAFT
-from lagros_policies.safety import SafetyFilter
+from lagros_policies.remarks.neural.metric import load_neural_metric
+from lagros_policies.safety.filter import SafetyFilter
 from lagros_policies.sb3_model import load_stable_baselines3
 from tests.policies.test_objects import CARTPOLE, OPTIONS, SPACECRAFT, world
 

@@ -6,10 +6,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
-from lagros_envs.cartpole import CartPoleEnv
-from lagros_envs.cartpole_task import CartPoleSettings
-from lagros_envs.cartpole_vector import CartPoleVectorEnv
 from lagros_envs.dynamics import hold_step
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
 from lagros_policies.actor import PpoPolicy, SacPolicy, Td3Policy
 from lagros_policies.baselines import LqrPolicy, RandomPolicy
 from lagros_policies.residual import ResidualPolicy

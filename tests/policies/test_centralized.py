@@ -7,13 +7,13 @@ import pytest
 
 import lagros_policies
 from lagros_envs import spacecraft_v0
-from lagros_envs.scenarios import PRESETS, Scenario
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_policies.centralized import CentralizedPolicy
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Scenario
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.contraction.double_integrator import expected_margin
-from lagros_policies.contraction.thrusters import allocate
-from lagros_policies.planning.spacecraft import SpacecraftPlannerSettings
 from lagros_policies.policy import Policy
+from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
+from lagros_policies.tasks.spacecraft.joint_planner import SpacecraftPlannerSettings
+from lagros_policies.tasks.spacecraft.thrusters import allocate
 
 GOALS_AT = 1 + 6  # of one agent: time, state, goal
 

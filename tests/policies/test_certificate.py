@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 
 from lagros_envs.dynamics import Spacecraft, jacobian
-from lagros_policies.contraction import Region, certificate_spacecraft, load_metric
-from lagros_policies.contraction.certificate_cartpole import (
+from lagros_policies.contraction import Region, load_metric
+from lagros_policies.contraction.double_integrator import design_axis
+from lagros_policies.contraction.statement import Statement
+from lagros_policies.proof.box import ProofBox
+from lagros_policies.tasks.cartpole.certificate import (
     CartPoleQuestion,
     cartpole_certificate,
     region_of,
 )
-from lagros_policies.contraction.certificate_spacecraft import spacecraft_certificate
-from lagros_policies.contraction.double_integrator import design_axis
-from lagros_policies.contraction.proof.box import ProofBox
-from lagros_policies.contraction.statement import Statement
+from lagros_policies.tasks.spacecraft import certificate as certificate_spacecraft
+from lagros_policies.tasks.spacecraft.certificate import spacecraft_certificate
 
 BOX = ProofBox(0.06, 0.3, 0.3, 0.3, angle_error=0.03, angular_rate_error=0.1)
 KEYS = {

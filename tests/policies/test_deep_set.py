@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from lagros_envs import spacecraft_v0
-from lagros_envs.observation import Layout
-from lagros_envs.scenarios import PRESETS, Scenario
-from lagros_policies.imitation.deep_set import DeepSet, pool
-from lagros_policies.imitation.spacecraft_features import NEIGHBOUR, OBSTACLE, OWN
-from lagros_policies.imitation.spacecraft_policy import SpacecraftNetworkPolicy
-from lagros_policies.sensed import Sensed
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Scenario
+from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_policies.learning.deep_set import DeepSet, pool
+from lagros_policies.tasks.spacecraft.features import NEIGHBOUR, OBSTACLE, OWN
+from lagros_policies.tasks.spacecraft.network_policy import SpacecraftNetworkPolicy
+from lagros_policies.tasks.spacecraft.sensed import Sensed
 
 
 def random_layers(rng: np.random.Generator, *widths: int):
@@ -157,7 +157,7 @@ def test_pooling_by_matrix_and_by_walk_agree(monkeypatch):
     for row, own, share in zip(values, owner, weight, strict=True):
         expected[own] += row * share
     for limit in (0, 10**9):
-        monkeypatch.setattr("lagros_policies.imitation.deep_set._DENSE", limit)
+        monkeypatch.setattr("lagros_policies.learning.deep_set._DENSE", limit)
         sums = np.zeros((50, 7), np.float32)
         pool(values.copy(), owner, weight, sums)
         np.testing.assert_allclose(sums, expected, atol=1e-5)
@@ -181,7 +181,7 @@ def test_damaged_and_foreign_files_are_refused(weights, tmp_path):
         DeepSet.load(bad)
     with pytest.raises(FileNotFoundError):
         DeepSet.load(tmp_path / "none.safetensors")
-    from lagros_policies.imitation.network_policy import PRETRAINED
+    from lagros_policies.learning.network_policy import PRETRAINED
 
     with pytest.raises(ValueError, match="not a deep set"):
         DeepSet.load(PRETRAINED / "cartpole_lagros.safetensors")

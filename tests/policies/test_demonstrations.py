@@ -14,10 +14,10 @@ import pytest
 
 import lagros_envs
 import lagros_policies
-from lagros_envs import cartpole_task as task
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import EVALUATION, episode_seeds
-from lagros_policies.imitation.demonstrations import (
+from lagros_envs.tasks.cartpole import task
+from lagros_policies.learning.demonstrations import (
     DemonstrationSettings,
     demonstrate,
     fly,

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from lagros_envs import spacecraft_v0
-from lagros_envs.observation import Layout
-from lagros_envs.scenarios import PRESETS, Scenario
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_policies.distributed import DistributedTubeMpcPolicy
-from lagros_policies.planning.local_motion import Discs
-from lagros_policies.planning.local_plan import LocalPlanner
-from lagros_policies.planning.local_problem import LocalPlannerSettings
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Scenario
+from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_policies.planning.local.motion import Discs
+from lagros_policies.planning.local.plan import LocalPlanner
+from lagros_policies.planning.local.problem import LocalPlannerSettings
 from lagros_policies.policy import Policy
+from lagros_policies.tasks.spacecraft.distributed import DistributedTubeMpcPolicy
 
 HERE = np.zeros(2)
 
@@ -227,7 +227,7 @@ def test_at_the_goal_nobody_is_stuck():
 
 
 def test_a_failure_of_the_solver_is_said_and_harmless(monkeypatch):
-    monkeypatch.setattr("lagros_policies.planning.local_problem._solve", lambda *_: None)
+    monkeypatch.setattr("lagros_policies.planning.local.problem._solve", lambda *_: None)
     plan = LocalPlanner().plan(np.array([2.0, 0.0, 0.0, 0.0]), HERE, Discs.none(), 20.0)
     assert not plan.solved
     policy = DistributedTubeMpcPolicy()

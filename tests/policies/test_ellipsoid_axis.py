@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lagros_policies.contraction.ellipsoid_axis import (
+from lagros_policies.tasks.spacecraft.ellipsoid_axis import (
     design_axis_ellipsoid,
     prove_axis_ellipsoid,
     worst_output,

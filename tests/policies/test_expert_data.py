@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lagros_envs import cartpole_task as task
-from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.contraction import Region, save_metric
-from lagros_policies.expert import CartPoleExpert
-from lagros_policies.imitation.dataset import ExpertDataSettings, generate
+from lagros_policies.learning.dataset import ExpertDataSettings, generate
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = ExpertDataSettings(plans=8, samples=160, shards=4, disturbance_bound=0.8, seed=5)
@@ -166,7 +166,7 @@ import os
 import sys
 from pathlib import Path
 from lagros_policies.contraction import load_metric
-from lagros_policies.imitation.dataset import ExpertDataSettings, generate
+from lagros_policies.learning.dataset import ExpertDataSettings, generate
 
 def report(done):
     print(done, flush=True)

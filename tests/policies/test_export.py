@@ -7,13 +7,13 @@ import subprocess
 import numpy as np
 import pytest
 
-from lagros_envs import cartpole_task as task
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.export import check, load_source
 from lagros_policies.export.c99 import TANH_ERROR, TANHS, c_source
 from lagros_policies.export.onnx import network_model, policy_model
 from lagros_policies.export.source import CARTPOLE_NAMES, example_observations
-from lagros_policies.imitation.network_policy import PRETRAINED
-from lagros_policies.imitation.networks import Mlp
+from lagros_policies.learning.network_policy import PRETRAINED
+from lagros_policies.learning.networks import Mlp
 
 needs_compiler = pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
 needs_onnx = pytest.mark.skipif(not check.has_onnxruntime(), reason="no onnxruntime")

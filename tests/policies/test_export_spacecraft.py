@@ -7,11 +7,11 @@ import subprocess
 import numpy as np
 import pytest
 
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.export import check, load_source
 from lagros_policies.export.file import c_file, onnx_file
 from lagros_policies.export.source import SPACECRAFT_NAMES
-from lagros_policies.imitation.deep_set import DeepSet
+from lagros_policies.learning.deep_set import DeepSet
 
 needs_compiler = pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
 needs_onnx = pytest.mark.skipif(not check.has_onnxruntime(), reason="no onnxruntime")

@@ -13,7 +13,7 @@ from lagros_policies.contraction.feedback import (
     preferred_deviation,
     riccati_gains,
 )
-from lagros_policies.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 STEPS, N = 12, 3
 

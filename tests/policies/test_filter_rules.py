@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lagros_envs.observation import Layout, global_state, observe
-from lagros_envs.scenarios import PRESETS, Scenario
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
-from lagros_policies.contraction.thrusters import allocate
-from lagros_policies.safety import SafetyFilter
-from lagros_policies.sensed import Sensed
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Scenario
+from lagros_envs.tasks.spacecraft.sensing import Layout, global_state, observe
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+from lagros_policies.safety.filter import SafetyFilter
+from lagros_policies.tasks.spacecraft.sensed import Sensed
+from lagros_policies.tasks.spacecraft.thrusters import allocate
 
 REST = np.zeros((1, 8), np.float32)
 

@@ -11,8 +11,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lagros_policies.imitation import train, train_deep_set
-from lagros_policies.imitation.fitting import Fit, one_thread
+from lagros_policies.learning import train, train_deep_set
+from lagros_policies.learning.fitting import Fit, one_thread
 
 
 @dataclass(frozen=True)

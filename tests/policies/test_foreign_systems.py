@@ -25,9 +25,6 @@ from lagros_policies.contraction import (
     Metric,
     Region,
     Samples,
-    adaptive,
-    certificate_cartpole,
-    certificate_spacecraft,
     certified_tube,
     contraction_residual,
     control,
@@ -39,25 +36,26 @@ from lagros_policies.contraction import (
     feedback,
     held_design,
     held_ellipsoid,
-    lagrangian,
     load_metric,
     robust_control,
     search_rate,
-    stochastic,
     theorems,
-    thrusters,
     tube_design,
     verify_metric,
-    wrench_control,
 )
 from lagros_policies.contraction.double_integrator import design_axis
-from lagros_policies.contraction.neural import design as neural_design
-from lagros_policies.contraction.neural import training as neural_training
-from lagros_policies.contraction.proof import cartpole as proof_cartpole
-from lagros_policies.contraction.proof import condition as proof_condition
-from lagros_policies.contraction.proof import design as proof_design
-from lagros_policies.contraction.proof import hold, lifted, motion, program, rates
-from lagros_policies.contraction.proof import spacecraft as proof_spacecraft
+from lagros_policies.proof import condition as proof_condition
+from lagros_policies.proof import hold, lifted, motion, rates
+from lagros_policies.remarks import adaptive, lagrangian, stochastic
+from lagros_policies.remarks.neural import design as neural_design
+from lagros_policies.remarks.neural import training as neural_training
+from lagros_policies.tasks.cartpole import certificate as certificate_cartpole
+from lagros_policies.tasks.cartpole import proof as proof_cartpole
+from lagros_policies.tasks.cartpole import proof_design
+from lagros_policies.tasks.cartpole import proof_program as program
+from lagros_policies.tasks.spacecraft import certificate as certificate_spacecraft
+from lagros_policies.tasks.spacecraft import proof as proof_spacecraft
+from lagros_policies.tasks.spacecraft import thrusters, wrench_control
 from tests.policies.foreign import (
     Pvtol,
     Ramp,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lagros_policies.half_planes import nearest
+from lagros_policies.safety.half_planes import nearest
 from tests.policies.programs import least_violation_by_program, nearest_by_program
 
 

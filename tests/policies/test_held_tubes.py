@@ -9,10 +9,6 @@ from scipy.interpolate import BPoly
 
 from lagros_envs.numbers import exact
 from lagros_policies.contraction import held_ellipsoid, load_metric
-from lagros_policies.contraction.certificate_cartpole import (
-    CartPoleQuestion,
-    cartpole_certificate,
-)
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.held_design import (
     HeldDesign,
@@ -24,11 +20,15 @@ from lagros_policies.contraction.held_ellipsoid import (
     held_statement,
     prove_held_tube,
 )
-from lagros_policies.contraction.proof.box import ProofBox
-from lagros_policies.contraction.proof.cells import Search, grid
-from lagros_policies.contraction.proof.lifted import LiftedCondition
 from lagros_policies.contraction.statement import at_most
 from lagros_policies.contraction.tube_design import PlanBox
+from lagros_policies.proof.box import ProofBox
+from lagros_policies.proof.cells import Search, grid
+from lagros_policies.proof.lifted import LiftedCondition
+from lagros_policies.tasks.cartpole.certificate import (
+    CartPoleQuestion,
+    cartpole_certificate,
+)
 
 PLAN = PlanBox(angle=0.05, velocity=0.3, angular_rate=0.1, force=0.3)
 BOUND, PERIOD = 0.1, 0.1

@@ -7,9 +7,10 @@ import sys
 import numpy as np
 import pytest
 
-from lagros_envs.dynamics.spacecraft import Spacecraft
-from lagros_policies.planning import grid_path, joint_scp
-from lagros_policies.planning.grid_path import (
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
+from lagros_policies.planning.joint import grid_path
+from lagros_policies.planning.joint import scp as joint_scp
+from lagros_policies.planning.joint.grid_path import (
     GridSettings,
     search_in_turn,
     segment_distance,
@@ -18,10 +19,13 @@ from lagros_policies.planning.grid_path import (
     straighten,
     walk,
 )
-from lagros_policies.planning.joint_plan import fly, swept_distances
-from lagros_policies.planning.joint_problem import JointScpSettings
+from lagros_policies.planning.joint.plan import fly, swept_distances
+from lagros_policies.planning.joint.problem import JointScpSettings
 from lagros_policies.planning.qp import QpSolution
-from lagros_policies.planning.spacecraft import SpacecraftPlanner, SpacecraftPlannerSettings
+from lagros_policies.tasks.spacecraft.joint_planner import (
+    SpacecraftPlanner,
+    SpacecraftPlannerSettings,
+)
 
 OBSTACLE, AGENT = 0.5, 0.25
 NONE = np.empty((0, 2))
@@ -153,7 +157,7 @@ def test_a_plan_is_the_same_every_time(crowded):
     assert np.array_equal(plan.states, again.states)
     code = (
         "import numpy as np\n"
-        "from lagros_policies.planning.spacecraft import SpacecraftPlanner\n"
+        "from lagros_policies.tasks.spacecraft.joint_planner import SpacecraftPlanner\n"
         f"p = SpacecraftPlanner().plan(np.array({starts.tolist()}), np.array({goals.tolist()}),"
         f" np.array({obstacles.tolist()}), {OBSTACLE}, {AGENT})\n"
         "print(p.states.tobytes().hex()[:4000])"

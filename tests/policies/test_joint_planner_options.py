@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from lagros_policies.contraction.double_integrator import design_axis
-from lagros_policies.planning.joint_plan import swept_distances
-from lagros_policies.planning.spacecraft import SpacecraftPlanner, SpacecraftPlannerSettings
+from lagros_policies.planning.joint.plan import swept_distances
+from lagros_policies.tasks.spacecraft.joint_planner import (
+    SpacecraftPlanner,
+    SpacecraftPlannerSettings,
+)
 
 NONE = np.empty((0, 2))
 STARTS = np.array([[0.0, 0.0], [0.0, 2.0], [4.0, 4.0]])

@@ -4,19 +4,22 @@ import numpy as np
 import pytest
 
 from lagros_envs import spacecraft_v0
-from lagros_envs.scenarios import Scenario
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_policies.centralized import CentralizedPolicy
-from lagros_policies.pace import time_to_go
-from lagros_policies.planning.joint_plan import swept_distances
-from lagros_policies.planning.joint_problem import JointScpSettings
-from lagros_policies.planning.joint_scp import JointSolution
-from lagros_policies.planning.spacecraft import SpacecraftPlanner, SpacecraftPlannerSettings
-from lagros_policies.spacecraft_expert import (
+from lagros_envs.tasks.spacecraft.scenarios import Scenario
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_policies.planning.joint.plan import swept_distances
+from lagros_policies.planning.joint.problem import JointScpSettings
+from lagros_policies.planning.joint.scp import JointSolution
+from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
+from lagros_policies.tasks.spacecraft.expert import (
     SEARCH_RADIUS,
     SpacecraftExpert,
     SpacecraftExpertSettings,
 )
+from lagros_policies.tasks.spacecraft.joint_planner import (
+    SpacecraftPlanner,
+    SpacecraftPlannerSettings,
+)
+from lagros_policies.tasks.spacecraft.pace import time_to_go
 
 NONE = np.empty((0, 2))
 OBSTACLE, AGENT = 0.5, 0.25
@@ -172,7 +175,7 @@ def test_where_no_plan_is_found_the_one_that_violates_least_is_shown(monkeypatch
         forces = np.zeros((len(states), problem.nodes, 2))
         return JointSolution(states, forces, False, f"short by {violation}", violation, 1)
 
-    monkeypatch.setattr("lagros_policies.planning.spacecraft.solve_joint", solve)
+    monkeypatch.setattr("lagros_policies.tasks.spacecraft.joint_planner.solve_joint", solve)
     settings = SpacecraftPlannerSettings(margins=(0.3,), restarts=2, searches=2)
     starts, goals = np.array([[0.0, 0.0]]), np.array([[3.0, 0.0]])
     plan = SpacecraftPlanner(settings).plan(starts, goals, NONE, OBSTACLE, AGENT)

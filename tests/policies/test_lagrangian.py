@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lagros_envs.dynamics import Spacecraft, hold_step
-from lagros_policies.contraction.lagrangian import (
+from lagros_policies.remarks.lagrangian import (
     SlidingAxis,
     SlidingTracking,
     hierarchical_bound,

@@ -6,19 +6,22 @@ import numpy as np
 import pytest
 
 from lagros_envs import spacecraft_v0
-from lagros_envs.cartpole import CartPoleEnv
-from lagros_envs.cartpole_task import CartPoleSettings
-from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies import make
-from lagros_policies.centralized import CentralizedPolicy
-from lagros_policies.contraction.thrusters import allocate, to_body
-from lagros_policies.distributed import DistributedTubeMpcPolicy
-from lagros_policies.planning.cartpole import CartPolePlanner
-from lagros_policies.planning.local_motion import Discs
-from lagros_policies.planning.local_plan import LocalPlanner
-from lagros_policies.planning.local_problem import LocalPlannerSettings
-from lagros_policies.planning.spacecraft import SpacecraftPlanner, SpacecraftPlannerSettings
-from lagros_policies.spacecraft_setup import plan_force_limit
+from lagros_policies.planning.local.motion import Discs
+from lagros_policies.planning.local.plan import LocalPlanner
+from lagros_policies.planning.local.problem import LocalPlannerSettings
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner
+from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
+from lagros_policies.tasks.spacecraft.distributed import DistributedTubeMpcPolicy
+from lagros_policies.tasks.spacecraft.joint_planner import (
+    SpacecraftPlanner,
+    SpacecraftPlannerSettings,
+)
+from lagros_policies.tasks.spacecraft.setup import plan_force_limit
+from lagros_policies.tasks.spacecraft.thrusters import allocate, to_body
 
 LEANING, GOAL = np.array([0.0, 0.6, 0.0, 0.0]), np.array([2.0, 0.0, 0.0, 0.0])
 

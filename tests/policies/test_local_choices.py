@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from lagros_policies.planning.local_guess import progress
-from lagros_policies.planning.local_map import LocalMap
-from lagros_policies.planning.local_motion import Discs, required_distances
-from lagros_policies.planning.local_plan import LocalPlanner
-from lagros_policies.planning.local_problem import LocalPlannerSettings, LocalProblem
+from lagros_policies.planning.local.guess import progress
+from lagros_policies.planning.local.map import LocalMap
+from lagros_policies.planning.local.motion import Discs, required_distances
+from lagros_policies.planning.local.plan import LocalPlanner
+from lagros_policies.planning.local.problem import LocalPlannerSettings, LocalProblem
 
 HERE = np.zeros(2)
 START = np.array([3.0, 0.0, 0.0, 0.0])

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from lagros_policies.planning.grid_path import GridSettings, segment_distance, shortest_paths
-from lagros_policies.planning.local_guess import pass_aside, way_around
-from lagros_policies.planning.local_map import LocalMap
-from lagros_policies.planning.local_motion import Discs
-from lagros_policies.planning.local_plan import LocalPlanner
-from lagros_policies.planning.local_problem import LocalPlannerSettings
+from lagros_policies.planning.joint.grid_path import GridSettings, segment_distance, shortest_paths
+from lagros_policies.planning.local.guess import pass_aside, way_around
+from lagros_policies.planning.local.map import LocalMap
+from lagros_policies.planning.local.motion import Discs
+from lagros_policies.planning.local.plan import LocalPlanner
+from lagros_policies.planning.local.problem import LocalPlannerSettings
 
 HERE = np.zeros(2)
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.dynamics import state_dependent_coefficient
-from lagros_policies import metric_design
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.contraction import (
     CvStemSettings,
     InfeasibleError,
@@ -21,7 +20,8 @@ from lagros_policies.contraction import (
     search_rate,
     verify_metric,
 )
-from lagros_policies.metric_design import (
+from lagros_policies.tasks.cartpole import metric_design
+from lagros_policies.tasks.cartpole.metric_design import (
     MetricDesignSettings,
     design_cartpole_metric,
     tube_samples,

@@ -32,8 +32,8 @@ from lagros_policies.contraction import (
     theorems,
     verify_metric,
 )
-from lagros_policies.contraction.proof.condition import prove_bounds
-from lagros_policies.contraction.stochastic import mean_square_bound
+from lagros_policies.proof.condition import prove_bounds
+from lagros_policies.remarks.stochastic import mean_square_bound
 from tests.policies.foreign import (
     Car,
     Pvtol,

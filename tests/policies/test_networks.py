@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.numpy import save
 
-from lagros_envs import cartpole_task as task
-from lagros_policies.imitation.features import FEATURES, cartpole_features
-from lagros_policies.imitation.networks import Mlp, read_safetensors, write_safetensors
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.learning.networks import Mlp, read_safetensors, write_safetensors
+from lagros_policies.tasks.cartpole.features import FEATURES, cartpole_features
 
 
 def random_network(widths, seed=0):

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lagros_envs import cartpole_task as task
 from lagros_envs.dynamics import CartPole
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction import (
     CvStemSettings,
     HeldControl,
@@ -21,16 +21,16 @@ from lagros_policies.contraction import (
     robust_control,
     verify_metric,
 )
-from lagros_policies.contraction.neural.design import hats, solve_at_angles, solve_on_pool
-from lagros_policies.contraction.neural.metric import (
+from lagros_policies.learning.networks import Mlp
+from lagros_policies.remarks.neural.design import hats, solve_at_angles, solve_on_pool
+from lagros_policies.remarks.neural.metric import (
     OUTPUTS,
     NeuralMetric,
     load_neural_metric,
     save_neural_metric,
 )
-from lagros_policies.contraction.neural.training import NeuralTrainingSettings, fit_network
-from lagros_policies.imitation.networks import Mlp
-from lagros_policies.metric_design import MetricDesignSettings, tube_samples
+from lagros_policies.remarks.neural.training import NeuralTrainingSettings, fit_network
+from lagros_policies.tasks.cartpole.metric_design import MetricDesignSettings, tube_samples
 
 MODEL, REGION = CartPole(), Region()
 SCALING = np.array([1.0, 12.0, 1.0, 1.5])

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 
 from lagros_envs import spacecraft_v0
-from lagros_envs.cartpole import CartPoleEnv
-from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.dynamics import CartPole
-from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies import NAMES, make
 from lagros_policies.policy import SPACECRAFT_NAMES
-from lagros_policies.safety import SafetyFilter
+from lagros_policies.safety.filter import SafetyFilter
 
-OPTIONS = "lagros_policies.options:"
+OPTIONS = "lagros_policies.remarks.policies:"
 CARTPOLE = (*NAMES, f"{OPTIONS}AdaptiveTubeMpcPolicy", f"{OPTIONS}NeuralTubeMpcPolicy")
 SPACECRAFT = (
     *SPACECRAFT_NAMES,

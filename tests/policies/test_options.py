@@ -12,18 +12,18 @@ import pytest
 
 import lagros_envs  # noqa: F401
 import lagros_policies
-from lagros_benchmarks.library import position_margin
-from lagros_envs import cartpole_task as task
+from lagros_benchmarks.run.library import position_margin
 from lagros_envs.dynamics import CartPole
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.control import HeldControl
-from lagros_policies.contraction.lagrangian import SlidingAxis, steady_position_bound
-from lagros_policies.contraction.neural.metric import NeuralMetric, load_neural_metric
+from lagros_policies.remarks.lagrangian import SlidingAxis, steady_position_bound
+from lagros_policies.remarks.neural.metric import NeuralMetric, load_neural_metric
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
-NEURAL = "lagros_policies.options:NeuralTubeMpcPolicy"
-ADAPTIVE = "lagros_policies.options:AdaptiveTubeMpcPolicy"
-SLIDING = "lagros_policies.options:SlidingCentralizedPolicy"
+NEURAL = "lagros_policies.remarks.policies:NeuralTubeMpcPolicy"
+ADAPTIVE = "lagros_policies.remarks.policies:AdaptiveTubeMpcPolicy"
+SLIDING = "lagros_policies.remarks.policies:SlidingCentralizedPolicy"
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,8 @@ import pytest
 import scipy.integrate
 import scipy.optimize
 
-from lagros_envs import cartpole_task as task
-from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.planning import CartPolePlanner, CartPolePlannerSettings, ScpSettings
 
 UPRIGHT = np.zeros(4)

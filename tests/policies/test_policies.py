@@ -10,12 +10,12 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import lagros_envs  # noqa: F401  registers the environment
-from lagros_envs import cartpole_task as task
-from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies import NAMES, Policy, make
-from lagros_policies.imitation.features import cartpole_features
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.learned import LearnedPolicy
+from lagros_policies.tasks.cartpole.features import cartpole_features
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
 SHORT = CartPoleSettings(time_limit=3.0, goal_range=1.0)
@@ -97,7 +97,7 @@ def test_unknown_name_is_refused_with_a_hint_and_the_names(env, name, hint):
 
 def test_a_package_that_is_missing_is_named(env, monkeypatch):
     monkeypatch.delitem(sys.modules, "lagros_policies.lagros")
-    monkeypatch.setitem(sys.modules, "lagros_policies.imitation.network_policy", None)
+    monkeypatch.setitem(sys.modules, "lagros_policies.learning.network_policy", None)
     with pytest.raises(ImportError, match=r"policy 'lagros' needs .*lagros\[policies\]"):
         make("lagros", env)
 
@@ -109,7 +109,7 @@ sys.modules[missing] = None
 import numpy as np
 import lagros_policies
 from lagros_envs import spacecraft_v0
-from lagros_envs.cartpole import CartPoleEnv
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
 from lagros_policies.policy import SPACECRAFT_NAMES
 failed = []
 for names, env in (

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lagros_envs.numbers import Interval, exact
-from lagros_policies.contraction.proof.cells import Examined, grid, remainder, search
-from lagros_policies.contraction.proof.matrices import negative_definite
+from lagros_policies.proof.cells import Examined, grid, remainder, search
+from lagros_policies.proof.matrices import negative_definite
 
 
 class Wave:

@@ -13,15 +13,15 @@ import lagros_policies
 from lagros_envs.dynamics import CartPole
 from lagros_envs.numbers import Interval
 from lagros_policies.contraction import Region, Samples, contraction_residual, load_metric
-from lagros_policies.contraction.proof.cartpole import PROVED_BOX, prove_cartpole
-from lagros_policies.contraction.proof.condition import (
+from lagros_policies.proof.condition import (
     ProofBox,
     largest_proved,
     prove_bounds,
     prove_contraction,
 )
-from lagros_policies.contraction.proof.matrices import negative_definite
-from lagros_policies.contraction.proof.rates import rate_condition
+from lagros_policies.proof.matrices import negative_definite
+from lagros_policies.proof.rates import rate_condition
+from lagros_policies.tasks.cartpole.proof import PROVED_BOX, prove_cartpole
 
 PROVED = Path(lagros_policies.__file__).parent / "pretrained" / "cartpole_proved_metric.json"
 SMALL = ProofBox(0.1, 0.5, 0.5, 0.5, angle_error=0.05, angular_rate_error=0.2)

@@ -13,9 +13,9 @@ from lagros_policies.contraction import (
     contraction_residual,
     load_metric,
 )
-from lagros_policies.contraction.proof import design as module
-from lagros_policies.contraction.proof.box import ProofBox
-from lagros_policies.contraction.proof.program import ProvedDesignSettings
+from lagros_policies.proof.box import ProofBox
+from lagros_policies.tasks.cartpole import proof_design as module
+from lagros_policies.tasks.cartpole.proof_program import ProvedDesignSettings
 
 SETTINGS = ProvedDesignSettings(
     cvstem=CvStemSettings(contraction_rate=0.5, degree=1, margin=0.3),

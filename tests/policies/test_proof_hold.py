@@ -9,9 +9,9 @@ import pytest
 import lagros_policies
 from lagros_envs.numbers import Interval
 from lagros_policies.contraction import HeldControl, load_metric
-from lagros_policies.contraction.proof.box import ProofBox
-from lagros_policies.contraction.proof.cells import search
-from lagros_policies.contraction.proof.hold import HoldCondition
+from lagros_policies.proof.box import ProofBox
+from lagros_policies.proof.cells import search
+from lagros_policies.proof.hold import HoldCondition
 
 PROVED = Path(lagros_policies.__file__).parent / "pretrained" / "cartpole_proved_metric.json"
 PERIOD, RATE = 0.1, 0.5

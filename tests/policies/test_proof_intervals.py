@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from lagros_envs.dynamics import CartPole
 from lagros_envs.numbers import Interval, exact
-from lagros_policies.contraction.proof.matrices import interval_jacobian, matmul
+from lagros_policies.proof.matrices import interval_jacobian, matmul
 
 NUMBERS = st.floats(-1e6, 1e6)
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from lagros_envs.numbers import Interval, Series, dual, exact, functions, variable
 from lagros_envs.numbers.functions import cos, sin
 from lagros_policies.contraction import load_metric
-from lagros_policies.contraction.proof.motion import (
+from lagros_policies.proof.motion import (
     accelerations,
     control_square,
     jacobian_parts,

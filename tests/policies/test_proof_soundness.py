@@ -13,20 +13,20 @@ from hypothesis import strategies as st
 import lagros_policies
 from lagros_envs.numbers import Interval
 from lagros_policies.contraction import Metric, load_metric
-from lagros_policies.contraction.certificate_cartpole import (
+from lagros_policies.contraction.double_integrator import certified_margin, design_axis, flow
+from lagros_policies.contraction.ellipsoid import prove_tube
+from lagros_policies.contraction.statement import at_most
+from lagros_policies.contraction.tube_design import PlanBox, TubeDesign, design_contained
+from lagros_policies.proof.box import ProofBox
+from lagros_policies.proof.condition import prove_contraction
+from lagros_policies.proof.hold import HoldCondition
+from lagros_policies.proof.rates import rate_condition, triangle_tip
+from lagros_policies.tasks.cartpole import proof as statements
+from lagros_policies.tasks.cartpole.certificate import (
     CartPoleQuestion,
     cartpole_certificate,
 )
-from lagros_policies.contraction.double_integrator import certified_margin, design_axis, flow
-from lagros_policies.contraction.ellipsoid import prove_tube
-from lagros_policies.contraction.proof import cartpole as statements
-from lagros_policies.contraction.proof.box import ProofBox
-from lagros_policies.contraction.proof.cartpole import prove_cartpole
-from lagros_policies.contraction.proof.condition import prove_contraction
-from lagros_policies.contraction.proof.hold import HoldCondition
-from lagros_policies.contraction.proof.rates import rate_condition, triangle_tip
-from lagros_policies.contraction.statement import at_most
-from lagros_policies.contraction.tube_design import PlanBox, TubeDesign, design_contained
+from lagros_policies.tasks.cartpole.proof import prove_cartpole
 
 PROVED = Path(lagros_policies.__file__).parent / "pretrained" / "cartpole_proved_metric.json"
 SMALL = ProofBox(0.1, 0.3, 0.3, 0.3)

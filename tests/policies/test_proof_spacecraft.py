@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lagros_envs.dynamics import control_matrix
-from lagros_envs.dynamics.spacecraft import Spacecraft
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.contraction.double_integrator import AxisMetric, design_axis
-from lagros_policies.contraction.proof import spacecraft as module
-from lagros_policies.contraction.proof.spacecraft import (
+from lagros_policies.tasks.spacecraft import proof as module
+from lagros_policies.tasks.spacecraft.proof import (
     control_square,
     prove_axis,
     prove_spacecraft,

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from lagros_envs.cartpole_task import FALL_ANGLE, CartPoleSettings
-from lagros_policies.distributed import DistributedTubeMpcPolicy
-from lagros_policies.expert import CartPoleExpert
+from lagros_envs.tasks.cartpole.task import FALL_ANGLE, CartPoleSettings
 from lagros_policies.planning import CartPolePlanner, Problem, solve_scp
-from lagros_policies.planning.cartpole import CartPolePlannerSettings
-from lagros_policies.planning.local_plan import LocalPlanner
+from lagros_policies.planning.local.plan import LocalPlanner
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.planner import CartPolePlannerSettings
+from lagros_policies.tasks.spacecraft.distributed import DistributedTubeMpcPolicy
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
 SHORT = CartPoleSettings(time_limit=3.0, goal_range=1.0)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from lagros_envs.scenarios import PRESETS
-from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.policy import row_memories
-from lagros_policies.spacecraft_setup import task_and_preset
+from lagros_policies.tasks.spacecraft.setup import task_and_preset
 
 
 def test_a_new_state_remembers_nothing():

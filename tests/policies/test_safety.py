@@ -7,16 +7,16 @@ import pytest
 
 from lagros_envs import spacecraft_v0
 from lagros_envs.conventions import beyond_the_end
-from lagros_envs.dynamics.spacecraft import Spacecraft
-from lagros_envs.observation import Layout
-from lagros_envs.scenarios import PRESETS, Scenario
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
-from lagros_policies.barrier import BarrierSettings, BrakingBarrier
-from lagros_policies.contraction.thrusters import allocate
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Scenario
+from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.policy import Policy
-from lagros_policies.safety import FilterState, SafetyFilter
-from lagros_policies.sensed import Sensed
+from lagros_policies.safety.barrier import BarrierSettings, BrakingBarrier
+from lagros_policies.safety.filter import FilterState, SafetyFilter
+from lagros_policies.tasks.spacecraft.sensed import Sensed
+from lagros_policies.tasks.spacecraft.thrusters import allocate
 from tests.policies.programs import least_violation_by_program, nearest_by_program
 
 PERIOD = 0.1

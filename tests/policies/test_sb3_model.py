@@ -17,13 +17,13 @@ from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from typer.testing import CliRunner
 
 import lagros_policies
-from lagros_benchmarks.cli import app
-from lagros_benchmarks.sb3_parallel import ParallelVecEnv
+from lagros_benchmarks.commands.cli import app
+from lagros_benchmarks.training.sb3_parallel import ParallelVecEnv
 from lagros_envs import spacecraft_v0
-from lagros_envs.cartpole import CartPoleEnv
-from lagros_envs.cartpole_vector import CartPoleVectorEnv
-from lagros_envs.spacecraft_single import SpacecraftEnv
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
+from lagros_envs.tasks.spacecraft.single import SpacecraftEnv
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.sb3_model import (
     ALGORITHMS,
     StableBaselines3Policy,

@@ -11,20 +11,20 @@ import pytest
 
 import lagros_envs  # noqa: F401  registers the environment
 import lagros_policies
-from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.seeding import EVALUATION, episode_seeds
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.contraction import (
     certified_tube,
     contraction_residual,
     extreme_eigenvalues,
     load_metric,
 )
-from lagros_policies.expert import CartPoleExpert
-from lagros_policies.imitation.dataset import ExpertDataSettings, generate
-from lagros_policies.imitation.features import cartpole_features
-from lagros_policies.imitation.network_policy import PRETRAINED
-from lagros_policies.imitation.networks import Mlp, read_safetensors
-from lagros_policies.imitation.train import learning_error
+from lagros_policies.learning.dataset import ExpertDataSettings, generate
+from lagros_policies.learning.network_policy import PRETRAINED
+from lagros_policies.learning.networks import Mlp, read_safetensors
+from lagros_policies.learning.train import learning_error
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.features import cartpole_features
 
 
 def needs(*names):

@@ -8,11 +8,11 @@ import pytest
 import lagros_policies
 from lagros_envs import spacecraft_v0
 from lagros_envs.seeding import EVALUATION, episode_seeds
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
-from lagros_policies.imitation.deep_set import DeepSet
-from lagros_policies.imitation.network_policy import PRETRAINED
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+from lagros_policies.learning.deep_set import DeepSet
+from lagros_policies.learning.network_policy import PRETRAINED
 from lagros_policies.policy import SPACECRAFT_NAMES
-from lagros_policies.safety import SafetyFilter
+from lagros_policies.safety.filter import SafetyFilter
 
 WORLDS, AGENTS = 12, 6
 

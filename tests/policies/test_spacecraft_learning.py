@@ -8,28 +8,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lagros_envs.observation import Layout
-from lagros_envs.scenarios import Scenario, preset_named
 from lagros_envs.seeding import EVALUATION, episode_seeds, episode_streams
-from lagros_envs.spacecraft_task import SpacecraftSettings
-from lagros_policies.imitation import train_deep_set
-from lagros_policies.imitation.spacecraft_features import spacecraft_features
-from lagros_policies.imitation.spacecraft_flights import (
-    FlightSettings,
-    fly_expert,
-    make_shard,
-    resize,
-)
-from lagros_policies.imitation.train_deep_set import (
+from lagros_envs.tasks.spacecraft.scenarios import Scenario, preset_named
+from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_policies.learning import train_deep_set
+from lagros_policies.learning.train_deep_set import (
     DeepSetTraining,
     SetSamples,
     fit_deep_set,
     flight_samples,
     join,
 )
-from lagros_policies.pace import CRUISE_SPEED
-from lagros_policies.sensed import Sensed
-from lagros_policies.spacecraft_expert import SpacecraftExpert, SpacecraftExpertSettings
+from lagros_policies.tasks.spacecraft.expert import SpacecraftExpert, SpacecraftExpertSettings
+from lagros_policies.tasks.spacecraft.features import spacecraft_features
+from lagros_policies.tasks.spacecraft.flights import (
+    FlightSettings,
+    fly_expert,
+    make_shard,
+    resize,
+)
+from lagros_policies.tasks.spacecraft.pace import CRUISE_SPEED
+from lagros_policies.tasks.spacecraft.sensed import Sensed
 
 TASK = SpacecraftSettings()
 SMALL = FlightSettings(worlds=2, worlds_per_shard=1, agents=(2,), sample_every=50, seed=3)

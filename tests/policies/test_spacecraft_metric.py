@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lagros_envs.dynamics import control_matrix, hold_step, jacobian
-from lagros_envs.dynamics.spacecraft import Spacecraft
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.contraction.double_integrator import (
     AxisMetric,
     certified_margin,
@@ -20,7 +20,7 @@ from lagros_policies.contraction.double_integrator import (
     state_tube,
     stiffness_range,
 )
-from lagros_policies.contraction.wrench_control import HeldBall, WrenchTracking
+from lagros_policies.tasks.spacecraft.wrench_control import HeldBall, WrenchTracking
 
 RATES = [0.3, 0.6, 1.0, 1.5, 3.0]
 rates = st.floats(0.05, 4.0)

@@ -7,13 +7,13 @@ import pytest
 
 import lagros_policies
 from lagros_envs import spacecraft_v0
-from lagros_envs.scenarios import PRESETS
 from lagros_envs.seeding import episode_seeds
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.actor import PRETRAINED
-from lagros_policies.imitation.networks import Mlp
+from lagros_policies.learning.networks import Mlp
 from lagros_policies.policy import SPACECRAFT_NAMES
-from lagros_policies.spacecraft_ppo import FEATURES, WEIGHTS, WRENCH, SpacecraftPpoPolicy
+from lagros_policies.tasks.spacecraft.ppo import FEATURES, WEIGHTS, WRENCH, SpacecraftPpoPolicy
 
 
 def flown(preset, agents, worlds, kind="uniform", bound=0.4):

@@ -10,13 +10,13 @@ from lagros_policies.contraction import load_metric
 from lagros_policies.contraction.control import error_energy
 from lagros_policies.contraction.double_integrator import AxisMetric, design_axis
 from lagros_policies.contraction.metric import Region
-from lagros_policies.contraction.stochastic import (
+from lagros_policies.remarks.stochastic import (
     MeanSquareBound,
     held_mean_square,
     mean_square_bound,
     noisy_hold_step,
 )
-from lagros_policies.contraction.wrench_control import WrenchTracking
+from lagros_policies.tasks.spacecraft.wrench_control import WrenchTracking
 
 BODY, PERIOD = Spacecraft(), 0.1
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from lagros_policies.contraction import Samples
-from lagros_policies.contraction.proof.box import ProofBox
 from lagros_policies.contraction.theorems import (
     contraction_distance,
     disturbed_rate,
@@ -17,6 +16,7 @@ from lagros_policies.contraction.theorems import (
     tube_ball,
     tube_ellipsoid,
 )
+from lagros_policies.proof.box import ProofBox
 
 
 def test_the_drift_bounds_the_relative_slope_of_the_metric_closely(metric, constant_metric):

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lagros_envs.dynamics import hold_step, vector_field
-from lagros_envs.dynamics.spacecraft import Spacecraft
-from lagros_policies.contraction.thrusters import (
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
+from lagros_policies.tasks.spacecraft.thrusters import (
     allocate,
     least_effort,
     thrust_for_acceleration,

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from lagros_envs import spacecraft_v0
-from lagros_envs.cartpole import CartPoleEnv
-from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.dynamics import CartPole
-from lagros_envs.dynamics.spacecraft import Spacecraft
-from lagros_envs.scenarios import PRESETS, Preset
-from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Preset
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tube import PaperTube
 from lagros_policies import NAMES, make
 from lagros_policies.actor import Actor
 from lagros_policies.contraction import load_metric
 from lagros_policies.export.source import load_source
-from lagros_policies.imitation.network_policy import PRETRAINED
-from lagros_policies.imitation.networks import read_safetensors, write_safetensors
+from lagros_policies.learning.network_policy import PRETRAINED
+from lagros_policies.learning.networks import read_safetensors, write_safetensors
 from lagros_policies.policy import SPACECRAFT_NAMES
 from lagros_policies.trained_for import SETTINGS, cartpole_range, weights_record
 
@@ -216,8 +216,8 @@ def test_the_shipped_metric_tracks_no_other_cart_pole():
     env = CartPoleEnv(settings=longer)
     for name in (
         "tube-mpc",
-        "lagros_policies.options:AdaptiveTubeMpcPolicy",
-        "lagros_policies.options:NeuralTubeMpcPolicy",
+        "lagros_policies.remarks.policies:AdaptiveTubeMpcPolicy",
+        "lagros_policies.remarks.policies:NeuralTubeMpcPolicy",
     ):
         with pytest.raises(ValueError, match=r"^system\.half_length=1\.0: the shipped metric"):
             make(name, env)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from lagros_policies.imitation.networks import Mlp, read_safetensors
-from lagros_policies.imitation.train import TrainingSettings, fit, learning_error
+from lagros_policies.learning.networks import Mlp, read_safetensors
+from lagros_policies.learning.train import TrainingSettings, fit, learning_error
 
 SETTINGS = TrainingSettings(
     hidden=(12, 12), epochs=9, batch=64, learning_rate=1e-2, checkpoint_every=2, seed=3

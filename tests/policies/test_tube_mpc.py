@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lagros_envs  # noqa: F401  registers the environment
-from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.planning import CartPolePlanner
 from lagros_policies.tube_mpc import TubeMpcPolicy
 

@@ -13,11 +13,11 @@ from pettingzoo.utils import wrappers as zoo
 from stable_baselines3.common import vec_env as sb3
 from stable_baselines3.common.monitor import Monitor
 
-from lagros_benchmarks.sb3_parallel import ParallelVecEnv
-from lagros_benchmarks.sb3_vector import SB3VectorEnv
+from lagros_benchmarks.training.sb3_parallel import ParallelVecEnv
+from lagros_benchmarks.training.sb3_vector import SB3VectorEnv
 from lagros_envs import spacecraft_v0
-from lagros_envs.cartpole import CartPoleEnv
-from lagros_envs.cartpole_task import CartPoleSettings
+from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies import make
 from lagros_policies.wrappers import HARMLESS, what_it_changes
 

@@ -12,7 +12,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv
 
 from lagros_benchmarks.training.settings import OffPolicy, Ppo, Sac, Td3, Training
-from lagros_policies.imitation.networks import Mlp
+from lagros_policies.learning.networks import Mlp
 
 
 def make_agent(training: Training, venv: VecEnv) -> BaseAlgorithm:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lagros_benchmarks.canvas import (
+from lagros_benchmarks.report.canvas import (
     Style,
     canvas,
     caption,
@@ -21,7 +21,7 @@ from lagros_benchmarks.canvas import (
     save,
     styles,
 )
-from lagros_benchmarks.surroundings import machine, versions
+from lagros_benchmarks.run.surroundings import machine, versions
 
 # What is drawn of each task: name in the curves, title, factor.
 _PANELS: dict[str, tuple[tuple[str, str, float], ...]] = {

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from lagros_benchmarks.training.cartpole import CartPoleLesson
+from lagros_benchmarks.tasks.cartpole.training import CartPoleLesson
+from lagros_benchmarks.tasks.spacecraft.training import SpacecraftLesson
 from lagros_benchmarks.training.run import Lesson
 from lagros_benchmarks.training.settings import CartPoleTraining, SpacecraftTraining, Training
-from lagros_benchmarks.training.spacecraft import SpacecraftLesson
 
 
 def lesson_of(training: Training, parallel_env: bool = False) -> Lesson:

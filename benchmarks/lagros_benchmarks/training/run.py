@@ -26,14 +26,14 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from lagros_benchmarks.files import plain, write_atomic, write_json
-from lagros_benchmarks.surroundings import machine, versions
+from lagros_benchmarks.run.files import plain, write_atomic, write_json
+from lagros_benchmarks.run.surroundings import machine, versions
 from lagros_benchmarks.training.agent import make_agent
 from lagros_benchmarks.training.curves import AXES
 from lagros_benchmarks.training.settings import Training
 from lagros_envs.checks import is_finite
 from lagros_envs.reading import Record, check_file
-from lagros_policies.imitation.networks import read_safetensors
+from lagros_policies.learning.networks import read_safetensors
 
 _LOG = logging.getLogger(__name__)
 WEIGHTS, RECORD, CHECKPOINT = "weights.safetensors", "record.json", "checkpoint.pt"

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, ClassVar
 
-from lagros_envs.cartpole_task import CartPoleSettings
 from lagros_envs.checks import (
     check_disturbance_bound,
     check_each,
@@ -23,8 +22,9 @@ from lagros_envs.checks import (
     suggestion,
 )
 from lagros_envs.disturbances import OPEN_LOOP
-from lagros_envs.scenarios import MOST_AGENTS, PRESETS
 from lagros_envs.seeding import EVALUATION
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS
 
 # Segments are namespaces of their own in `lagros_envs.seeding`'s sense, far below `EVALUATION`.
 MOST_SEGMENTS = 1 << 16

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from lagros_benchmarks.formats import number, percent, with_interval
+from lagros_benchmarks.report.formats import number, percent, with_interval
 
 if TYPE_CHECKING:
     from rich.table import Table

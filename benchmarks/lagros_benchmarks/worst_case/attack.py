@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401  (registers the environments)
-from lagros_benchmarks.claims import position_margin
-from lagros_benchmarks.episodes import ACTION
-from lagros_benchmarks.flying import rehearse
-from lagros_benchmarks.library import building, make_filter, make_single_policy
-from lagros_benchmarks.metrics import wilson_interval
-from lagros_benchmarks.settings import check_policy, check_task
-from lagros_benchmarks.spacecraft_episodes import bare, rehearse_in
-from lagros_benchmarks.worst_case.cartpole import (
+from lagros_benchmarks.evidence.claims import position_margin
+from lagros_benchmarks.run.episodes import ACTION
+from lagros_benchmarks.run.flying import rehearse
+from lagros_benchmarks.run.library import building, make_filter, make_single_policy
+from lagros_benchmarks.run.metrics import wilson_interval
+from lagros_benchmarks.run.settings import check_policy, check_task
+from lagros_benchmarks.tasks.cartpole.worst_case import (
     GOALS,
     CartPoleTarget,
     Episodes,
@@ -31,9 +30,15 @@ from lagros_benchmarks.worst_case.cartpole import (
     random_pushes,
     tracking_law,
 )
+from lagros_benchmarks.tasks.spacecraft.episodes import bare, rehearse_in
+from lagros_benchmarks.tasks.spacecraft.plane import worst_plane_pushes
+from lagros_benchmarks.tasks.spacecraft.worst_case import (
+    PARAMETERS,
+    SpacecraftTarget,
+    first_adversaries,
+)
 from lagros_benchmarks.worst_case.certificate import TubeCheck
 from lagros_benchmarks.worst_case.optimisers import make_search
-from lagros_benchmarks.worst_case.plane import worst_plane_pushes
 from lagros_benchmarks.worst_case.replay import (
     Outcome,
     WorstCases,
@@ -43,12 +48,6 @@ from lagros_benchmarks.worst_case.replay import (
 from lagros_benchmarks.worst_case.search import MOST, Found, SearchSettings, search
 from lagros_benchmarks.worst_case.seeds import ATTACK
 from lagros_benchmarks.worst_case.sequences import Replay
-from lagros_benchmarks.worst_case.spacecraft import (
-    PARAMETERS,
-    SpacecraftTarget,
-    first_adversaries,
-)
-from lagros_envs import cartpole_task, spacecraft_task
 from lagros_envs.checks import (
     check_disturbance_bound,
     check_fields,
@@ -59,11 +58,13 @@ from lagros_envs.checks import (
 )
 from lagros_envs.disturbances import Disturbance
 from lagros_envs.reading import Record
-from lagros_envs.scenarios import MOST_AGENTS, PRESETS
 from lagros_envs.seeding import episode_seeds, episode_streams
-from lagros_envs.spacecraft_vector import SpacecraftVectorEnv
-from lagros_policies.expert import CartPoleExpert
-from lagros_policies.options import NeuralTubeMpcPolicy
+from lagros_envs.tasks.cartpole import task as cartpole_task
+from lagros_envs.tasks.spacecraft import task as spacecraft_task
+from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+from lagros_policies.remarks.policies import NeuralTubeMpcPolicy
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
 FloatArray = NDArray[np.float64]

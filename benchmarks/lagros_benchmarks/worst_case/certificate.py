@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_benchmarks.episodes import TUBE_TOLERANCE
-from lagros_benchmarks.worst_case.cartpole import CartPoleTarget, Episodes, Flights, fly
-from lagros_envs import cartpole_task as task
+from lagros_benchmarks.run.episodes import TUBE_TOLERANCE
+from lagros_benchmarks.tasks.cartpole.worst_case import CartPoleTarget, Episodes, Flights, fly
 from lagros_envs.dynamics import control_matrix
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction import certified_tube
 from lagros_policies.contraction.metric import region_angle
-from lagros_policies.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -20,17 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401  (registers the environments)
-from lagros_benchmarks.episodes import ACTION, TUBE_TOLERANCE
-from lagros_benchmarks.flying import Attempt, ask, reseed
-from lagros_benchmarks.library import Policy
-from lagros_benchmarks.worst_case.cartpole import Episodes, Flights, scores
+from lagros_benchmarks.run.episodes import ACTION, TUBE_TOLERANCE
+from lagros_benchmarks.run.flying import Attempt, ask, reseed
+from lagros_benchmarks.run.library import Policy
+from lagros_benchmarks.tasks.cartpole.worst_case import Episodes, Flights, scores
+from lagros_benchmarks.tasks.spacecraft.worst_case import SpacecraftTarget
 from lagros_benchmarks.worst_case.sequences import Replay
-from lagros_benchmarks.worst_case.spacecraft import SpacecraftTarget
-from lagros_envs import cartpole_task as task
 from lagros_envs.checks import is_number, shown
 from lagros_envs.files import write_atomic
 from lagros_envs.reading import Record, named, parse_json, read_npz
-from lagros_envs.spacecraft_task import SpacecraftSettings
+from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 
 FloatArray = NDArray[np.float64]
 

@@ -1,0 +1,241 @@
+"""`lagros attack`: search the bounded disturbance that a policy stands worst.
+
+Only the standard library, typer and `terminal` are imported here; the command imports the rest.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lagros_benchmarks.commands.extras import check_extra
+from lagros_benchmarks.commands.outputs import Delivery, check_outputs, policy_files
+from lagros_benchmarks.commands.terminal import (
+    fail,
+    find_users_modules,
+    options_given,
+    refuse_options,
+)
+
+if TYPE_CHECKING:
+    from lagros_benchmarks.worst_case.attack import AttackSettings
+    from lagros_benchmarks.worst_case.replay import Outcome
+
+BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
+# Flights per episode: a flight of six spacecraft costs what a hundred of a cart-pole do.
+BUDGETS = {"cartpole": 1000, "spacecraft": 100}
+EPISODES = {"cartpole": 10, "spacecraft": 3}
+
+
+def attack(
+    task: Annotated[str, typer.Argument(help="cartpole or spacecraft.")],
+    policy: Annotated[
+        str, typer.Option(metavar="NAME", help="A policy of the task, as for `lagros bench`.")
+    ] = "lagros",
+    goal: Annotated[
+        str,
+        typer.Option(
+            help="What to break: tube (||x - x_d||), success, or clearance (a fall, a collision)."
+        ),
+    ] = "success",
+    bound: Annotated[
+        float | None,
+        typer.Option(
+            metavar="D",
+            help="Bound d̄ of the disturbance, in units of the state per second. "
+            "(default: 0.75 for cartpole, 0.4 for spacecraft)",
+        ),
+    ] = None,
+    episodes: Annotated[
+        int | None,
+        typer.Option(help="Episodes, each with its own worst case. (default: 10; spacecraft 3)"),
+    ] = None,
+    budget: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Flights per episode. (default: 1000; spacecraft 100)"),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of episodes and search.")] = 0,
+    method: Annotated[
+        str,
+        typer.Option(help="Of random, cross-entropy, cma, gradient, hybrid; cartpole only."),
+    ] = "hybrid",
+    safety_filter: Annotated[
+        bool, typer.Option("--safety-filter", help="Put the safety filter on the policy.")
+    ] = False,
+    json: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", dir_okay=False, help="All figures, as JSON."),
+    ] = None,
+    npz: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", dir_okay=False, help="The sequences found, to replay."),
+    ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            dir_okay=False,
+            help="Fly the sequences of such a file again, and fail where a figure differs.",
+        ),
+    ] = None,
+) -> None:
+    """Search the worst bounded disturbance, fly it, and hold the certificate against it.
+
+    Exit status 3: everything is written, and the policy raised in some episodes, which are broken.
+    """
+    from lagros_benchmarks.run.library import SetupError
+
+    find_users_modules([policy])
+    try:
+        if replay is not None:
+            refuse_options(
+                options_given(but=("--replay", "--policy")),
+                "--replay flies what the file says",
+            )
+            _replay(task, policy, replay)
+            return
+        settings = _settings(task, policy, goal, bound, episodes, budget, seed, method)
+        if safety_filter:
+            from dataclasses import replace
+
+            settings = replace(settings, safety_filter=True)
+        check_outputs({"--json": json, "--npz": npz}, policy_files([policy]))
+        _search(settings, json, npz)
+    except (ValueError, OSError) as error:
+        fail(error)
+    except (ImportError, SetupError) as error:
+        fail(error, status=1)
+
+
+def _settings(
+    task: str,
+    policy: str,
+    goal: str,
+    bound: float | None,
+    episodes: int | None,
+    budget: int | None,
+    seed: int,
+    method: str,
+) -> AttackSettings:
+    from lagros_benchmarks.run.settings import check_task
+    from lagros_benchmarks.worst_case.attack import AttackSettings
+    from lagros_benchmarks.worst_case.search import SearchSettings
+
+    check_task(task)
+    if task == "spacecraft" and method != "hybrid":
+        raise ValueError(
+            f"--method {method}: the spacecraft has one search only; leave --method out"
+        )
+    if method == "cma":
+        check_extra("--method cma", "attack")
+    flights = BUDGETS[task] if budget is None else budget
+    population = 30 if task == "cartpole" else 16
+    return AttackSettings(
+        task=task,
+        policy=policy,
+        goal=goal,
+        bound=BOUNDS[task] if bound is None else bound,
+        episodes=EPISODES[task] if episodes is None else episodes,
+        seed=seed,
+        search=SearchSettings(method, budget=flights, population=population),
+    )
+
+
+def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> None:
+    from lagros_benchmarks.run.files import json_text
+    from lagros_benchmarks.worst_case.attack import run_attack
+    from lagros_benchmarks.worst_case.replay import save_worst_cases
+
+    found = run_attack(settings, lambda text: typer.echo(text, err=True))
+    delivery = Delivery()
+    record = {"command": " ".join(["lagros", *sys.argv[1:]]), **found.row}
+    delivery.write_text(json, lambda: json_text(record))
+    delivery.write(npz, lambda path: save_worst_cases(found.cases, path))
+    for line in summary(found.row):
+        typer.echo(line)
+    delivery.tell()
+    if found.row["errors"]:
+        from lagros_benchmarks.run.flying import RAISED, raised_line
+
+        line = raised_line([(settings.policy, found.row["errors"], found.row["episodes"])])
+        typer.echo(f"lagros: {line}", err=True)
+        raise typer.Exit(RAISED)
+
+
+def _replay(task: str, policy: str, path: Path) -> None:
+    from lagros_benchmarks.run.settings import check_task
+    from lagros_benchmarks.worst_case.attack import fly_again
+    from lagros_benchmarks.worst_case.replay import load_worst_cases
+
+    check_task(task)
+    try:
+        cases = load_worst_cases(path)
+        _check_command(cases.command, task, policy)
+        flown = fly_again(cases)
+    except FileNotFoundError as error:
+        raise ValueError(f"--replay: {error}; --npz of an earlier attack writes one") from None
+    except ValueError as error:
+        text = str(error)
+        raise ValueError(f"--replay: {text if str(path) in text else f'{path}: {text}'}") from None
+    differing = 0
+    for before, now in zip(cases.outcomes, flown, strict=True):
+        same = before == now
+        differing += not same
+        typer.echo(f"{_line(now)}: {'as stored' if same else f'differs, stored {_line(before)}'}")
+    if differing:
+        typer.echo(f"lagros: {differing} of {len(cases.outcomes)} differ", err=True)
+        raise typer.Exit(1)
+
+
+def _check_command(command: Mapping[str, Any], task: str, policy: str) -> None:
+    """Check what a file says that it was made with against what was asked for.
+
+    Raises:
+        ValueError: It is of another task, or of a policy that is code and was not asked for.
+    """
+    from lagros_policies.naming import is_code
+
+    if command.get("task") != task:
+        raise ValueError(f"it is of the task {command.get('task')!r}, not {task!r}")
+    its = str(command.get("policy"))
+    if is_code(its) and its != policy:
+        raise ValueError(
+            f"it was found against {its!r}, which is code of somebody's: name it, too, with "
+            f"--policy {its}, if you trust it"
+        )
+
+
+def _line(outcome: Outcome) -> str:
+    broken = "broken" if outcome.broken else "held"
+    return f"seed {outcome.seed} {broken} score {outcome.score!r}"
+
+
+def summary(row: dict[str, Any]) -> list[str]:
+    """Return what an attack came to, in a few lines."""
+    worn = "+filter" if row["safety_filter"] else ""
+    count = row["episodes"]
+    lines = [
+        f"{row['task']}, {row['policy']}{worn}, goal {row['goal']}, bound {row['bound']:g}: "
+        f"{row['flights_per_episode']} flights for each of {count} episodes, "
+        f"{row['search_seconds']:.0f} s",
+        f"broken in {100 * row['broken_rate']:.0f} % of the episodes "
+        f"(random disturbance: {100 * row['random_broken_rate']:.0f} %)",
+        f"worst score {row['score_worst']:.4g}, median {row['score_median']:.4g} "
+        f"(random: worst {row['random_score_worst']:.4g})",
+    ]
+    if row.get("max_tracking_error_max") is not None:
+        left = round((1.0 - row["in_region_rate"]) * count)
+        lines.append(
+            f"observed tube {row['max_tracking_error_max']:.3g}; {left} of {count} flights left "
+            "the region of the metric"
+        )
+    if row.get("share_of_certified_max") is not None:
+        lines.append(
+            f"observed position error {row['max_position_error_max']:.3g} m, "
+            f"{100 * row['share_of_certified_max']:.3g} % of the certified margin"
+        )
+    return lines

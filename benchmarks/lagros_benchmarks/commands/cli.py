@@ -1,0 +1,386 @@
+"""The command line `lagros`.
+
+Only the standard library, typer and `terminal` are imported here; what a command needs is imported
+inside it, so that `lagros --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lagros_benchmarks.commands.attack import attack
+from lagros_benchmarks.commands.certify import certify
+from lagros_benchmarks.commands.data import data
+from lagros_benchmarks.commands.export import export
+from lagros_benchmarks.commands.extras import check_extra
+from lagros_benchmarks.commands.outputs import check_outputs, policy_files
+from lagros_benchmarks.commands.streams import printing_failed
+from lagros_benchmarks.commands.terminal import (
+    Command,
+    Commands,
+    fail,
+    find_users_modules,
+    interrupted,
+    listed,
+    listed_or_none,
+    progress_bar,
+    progress_line,
+    refuse_options,
+)
+from lagros_benchmarks.commands.train import train
+from lagros_benchmarks.commands.watch import watch
+from lagros_benchmarks.run.process import undone
+
+if TYPE_CHECKING:
+    from lagros_benchmarks.report.delivery import Outputs
+    from lagros_benchmarks.report.records import Row
+    from lagros_benchmarks.run.keeping import Kept
+    from lagros_benchmarks.run.reproduction import Reproduction
+    from lagros_benchmarks.run.settings import BenchmarkSettings
+    from lagros_policies.backends import Backend
+
+BENCH_FOLDER, DEMO_FOLDER = Path("runs/bench"), Path("runs/demo")
+# The paper's experiment: the default policies, 50 episodes, uniform disturbance.
+DEMO: dict[str, Any] = {"episodes": 50, "disturbances": ("uniform",), "bounds": (0.75,)}
+
+app = typer.Typer(
+    cls=Commands,
+    help="Learning-based robust motion planning with guaranteed stability.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_show_locals=False,
+)
+
+
+def _file(explanation: str) -> Any:
+    return typer.Option(metavar="FILE", dir_okay=False, help=explanation)
+
+
+BACKEND_OPTION = typer.Option(help="Whose processes the workers are: of loky, ray or dask.")
+ADDRESS_OPTION = typer.Option(
+    help="Of a running cluster of ray or dask, which is used with the workers that it has."
+)
+
+
+@app.callback(invoke_without_command=True)
+def main(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
+) -> None:
+    """Learning-based robust motion planning with guaranteed stability."""
+    if version:
+        from lagros_benchmarks.run.surroundings import versions
+
+        typer.echo(f"lagros {versions().get('lagros', '(run from its folder, not installed)')}")
+        raise typer.Exit
+
+
+@app.command(cls=Command)
+def bench(
+    task: Annotated[str, typer.Argument(help="cartpole, or spacecraft.")],
+    policies: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME[,NAME]",
+            help="cartpole: of learned, tube-mpc, lagros, lqr, random, ppo, sac, td3, residual. "
+            "spacecraft: of learned, tube-mpc, lagros, centralized, ppo. Or a "
+            "stable-baselines3 .zip, or module:Class.",
+        ),
+    ] = None,
+    episodes: Annotated[
+        int | None, typer.Option(help="Episodes (worlds) of each policy and condition; 50.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed; its episodes never occur in training.")] = 0,
+    disturbance: Annotated[
+        str,
+        typer.Option(
+            metavar="KIND[,KIND]",
+            help="Of none, uniform, sphere, constant, sinusoid, gust, worst.",
+        ),
+    ] = "uniform",
+    bound: Annotated[
+        str | None,
+        typer.Option(
+            metavar="D[,D]",
+            help="Bounds d̄ of the disturbance, in units of the state per second. cartpole: 0.75; "
+            "spacecraft: 0.2,0.4,0.6,0.8,1.0.",
+        ),
+    ] = None,
+    channels: Annotated[str, typer.Option(help="Disturbed states: all, or rates.")] = "all",
+    agents: Annotated[
+        str | None,
+        typer.Option(metavar="N[,N]", help="Spacecraft in a world, 6; several compare them."),
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help="Spacecraft: paper, released, crossing, open or swarm."),
+    ] = None,
+    safety_filter: Annotated[
+        str | None,
+        typer.Option(help="Spacecraft: none, all (policies wear it) or both; both."),
+    ] = None,
+    jobs: Annotated[
+        int, typer.Option(help="Worker processes; Δt is then measured in a serial pass after.")
+    ] = 1,
+    backend: Annotated[str, BACKEND_OPTION] = "loky",
+    address: Annotated[str | None, ADDRESS_OPTION] = None,
+    timing_episodes: Annotated[
+        int, typer.Option(help="Episodes of that pass, which spacecraft always have.")
+    ] = 10,
+    replan_every: Annotated[
+        int | None, typer.Option(help="cartpole: control steps between the plans of tube-mpc, 1.")
+    ] = None,
+    json: Annotated[Path | None, _file("All figures, one object per policy and condition.")] = None,
+    csv: Annotated[Path | None, _file("The scalar figures.")] = None,
+    latex: Annotated[Path | None, _file("The table, for LaTeX with booktabs.")] = None,
+    markdown: Annotated[Path | None, _file("The table, as Markdown.")] = None,
+    figure: Annotated[
+        Path | None,
+        _file(
+            "cartpole: error over time, or success against the bound. spacecraft: success and "
+            "effort, against the bound; against the number of agents success and time."
+        ),
+    ] = None,
+    scene: Annotated[
+        Path | None, _file("Spacecraft: trajectories of every policy in one world.")
+    ] = None,
+    scene_world: Annotated[int, typer.Option(help="Which of the run's worlds, from 0.")] = 0,
+    episodes_file: Annotated[
+        Path | None, _file("Every episode (every agent), as JSON Lines.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            file_okay=False,
+            help="Keeps finished work, with which the same command goes on where it was killed. "
+            f"If left out it is {BENCH_FOLDER}, and emptied at the end.",
+        ),
+    ] = None,
+) -> None:
+    """Compare policies on the same episodes; print the table, write what is asked for.
+
+    A policy is waited for, however long it takes. Exit status 3: everything is written, and in some
+    episodes a policy raised; they count as failures, and their rows are marked.
+    """
+    from lagros_benchmarks.report.delivery import Outputs
+    from lagros_benchmarks.run.settings import (
+        DEFAULT_POLICIES,
+        BenchmarkSettings,
+        check_policy,
+        check_task,
+    )
+    from lagros_envs.checks import check_whole
+    from lagros_envs.tasks.cartpole.task import CartPoleSettings
+    from lagros_policies.backends import Backend
+    from lagros_policies.naming import listed_names
+
+    outputs = Outputs(json, csv, latex, markdown, figure, episodes_file, scene, scene_world)
+    named = None if policies is None else listed_names(policies)
+    find_users_modules(named or ())
+    try:
+        check_task(task)
+        if named is not None and "" in named:
+            raise ValueError("--policies: an entry is empty; write them as a,b")
+        if scene is None:
+            refuse_options(["--scene-world"], "no --scene is asked for")
+        if disturbance.strip() == "none":
+            refuse_options(["--bound"], "no disturbance has a bound")
+        if replan_every is not None:
+            if task != "cartpole":
+                raise ValueError(f"--replan-every is for cartpole; leave it out for {task}")
+            if "tube-mpc" not in (named or DEFAULT_POLICIES):
+                raise ValueError("--replan-every is for tube-mpc, which is none of --policies")
+            check_whole("replan_every", replan_every, 1, CartPoleSettings().steps)
+        settings = BenchmarkSettings.for_task(
+            task,
+            policies=listed_or_none(named, str, "--policies"),
+            policy_settings=None
+            if replan_every is None
+            else {"tube-mpc": {"replan_every": replan_every}},
+            episodes=episodes,
+            seed=seed,
+            disturbances=listed(disturbance, str, "--disturbance"),
+            bounds=listed_or_none(bound, float, "--bound"),
+            channels=channels,
+            agents=listed_or_none(agents, int, "--agents"),
+            preset=preset,
+            safety_filter=safety_filter,
+            jobs=jobs,
+            timing_episodes=timing_episodes,
+            backend=Backend(backend, address),
+        )
+        for name in settings.policies:
+            check_policy(name, task)
+        files = policy_files(settings.policies)
+        outputs.check(task, settings.episodes, files, {"--out": out}, BENCH_FOLDER)
+    except ValueError as error:
+        fail(error)
+    run_and_report(settings, outputs, out or BENCH_FOLDER, keep=out is not None)
+
+
+@app.command(cls=Command)
+def demo() -> None:
+    """The paper's cart-pole experiment: 50 paired episodes, the table and the figure."""
+    from lagros_benchmarks.report.delivery import Outputs
+    from lagros_benchmarks.run.settings import BenchmarkSettings
+
+    outputs = Outputs(json=DEMO_FOLDER / "results.json", figure=DEMO_FOLDER / "error.png")
+    try:
+        outputs.check()
+    except ValueError as error:
+        fail(error)
+    run_and_report(BenchmarkSettings(**DEMO), outputs, DEMO_FOLDER)
+
+
+@app.command(cls=Command)
+def reproduce(
+    task: Annotated[str, typer.Argument(help="cartpole or spacecraft.")],
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            file_okay=False,
+            help="Where the run is kept and resumed; runs/reproduce-TASK if left out.",
+        ),
+    ] = None,
+    jobs: Annotated[int, typer.Option(help="Worker processes; they change no result.")] = 2,
+    backend: Annotated[str, BACKEND_OPTION] = "loky",
+    address: Annotated[str | None, ADDRESS_OPTION] = None,
+    episodes: Annotated[
+        int | None,
+        typer.Option(help="Episodes (worlds) of each policy in the table; 50, spacecraft 20."),
+    ] = None,
+    shipped: Annotated[
+        bool, typer.Option("--shipped-weights", help="Only the benchmark, with what is shipped.")
+    ] = False,
+) -> None:
+    """From nothing to the table and figures: metric or expert, data, training, benchmark."""
+    from lagros_benchmarks.run.reproduction import reproduce as run_reproduction
+    from lagros_benchmarks.run.settings import check_task
+    from lagros_policies.backends import Backend, BackendError, running
+
+    place = folder or Path(f"runs/reproduce-{task}")
+    try:
+        check_task(task)
+        if not shipped:
+            check_extra("lagros reproduce", "train")
+        workers = Backend(backend, address)
+        wanted = _reproduction(task, episodes, jobs, workers)
+        outputs = _reproduced(task, place)
+        check_outputs({}, folders={"--out": place})
+        outputs.check(task)
+        with progress_bar() as progress, running(workers, jobs):
+            benchmark = (
+                wanted.benchmark(None)
+                if shipped
+                else run_reproduction(place, wanted, progress, progress_line)
+            )
+    except ValueError as error:
+        fail(str(error).replace("worlds=", "--episodes="))
+    except (ImportError, BackendError) as error:
+        fail(error, status=1)
+    except KeyboardInterrupt:
+        interrupted(f"; the same command goes on with what is in {place}")
+    run_and_report(benchmark, outputs, place / "benchmark", keep=True)
+
+
+def _reproduction(task: str, episodes: int | None, jobs: int, backend: Backend) -> Reproduction:
+    """Return what a task's run makes."""
+    asked: dict[str, Any] = {"jobs": jobs, "backend": backend}
+    if task == "cartpole":
+        from lagros_benchmarks.tasks.cartpole.reproduce import ReproduceSettings
+
+        return ReproduceSettings(**asked | ({} if episodes is None else {"episodes": episodes}))
+    from lagros_benchmarks.tasks.spacecraft.reproduce import SpacecraftReproduceSettings
+
+    return SpacecraftReproduceSettings(**asked | ({} if episodes is None else {"worlds": episodes}))
+
+
+def _reproduced(task: str, folder: Path) -> Outputs:
+    from lagros_benchmarks.report.delivery import Outputs
+
+    return Outputs(
+        json=folder / "results.json",
+        latex=folder / "table.tex",
+        figure=folder / ("error.png" if task == "cartpole" else "sweep.png"),
+        scene=folder / "scene.png" if task == "spacecraft" else None,
+    )
+
+
+app.command(cls=Command)(watch)
+app.command(cls=Command)(export)
+app.command(cls=Command)(certify)
+app.command(cls=Command)(train)
+app.command(cls=Command)(attack)
+app.add_typer(data, name="data")
+
+
+def run_and_report(
+    settings: BenchmarkSettings, outputs: Outputs, folder: Path, keep: bool = False
+) -> list[Row]:
+    """Run a benchmark with a progress bar, write its files and print its table.
+
+    Args:
+        settings: What to run.
+        outputs: What to write.
+        folder: Keeps finished work until the run is complete and its results are safe.
+        keep: Whether the work stays there even then.
+
+    Returns:
+        The rows.
+
+    Raises:
+        typer.Exit: With status 1 if the run cannot begin or a file was not written, with 3 if
+            episodes raised.
+    """
+    from lagros_benchmarks.report.delivery import print_report
+    from lagros_benchmarks.report.records import summarise
+    from lagros_benchmarks.run.flying import RAISED, raised_line
+    from lagros_benchmarks.run.library import SetupError
+    from lagros_benchmarks.run.runner import kept_in, run_benchmark
+    from lagros_envs.files import remove_folders
+    from lagros_policies.backends import BackendError
+
+    kept = kept_in(folder, settings)
+    if len(kept):
+        progress_line(
+            f"going on with {len(kept)} finished chunks of {kept.folder}; remove it to begin anew"
+        )
+    try:
+        # What policies print is not ours, and where they go is no matter.
+        with progress_bar() as progress, redirect_stdout(sys.stderr), undone():
+            run = run_benchmark(settings, progress=progress, kept=kept)
+        rows = summarise(run)
+        delivery = outputs.write(run, rows)
+    except (SetupError, BackendError) as error:
+        # No weights, damaged weights, an extra that is not installed, a cluster that is not there.
+        fail(error, status=1)
+    except KeyboardInterrupt:
+        interrupted(_where_kept(kept))
+    print_report(rows)
+    if delivery.problems or not (delivery.written or printing_failed() is None):
+        if len(kept):
+            progress_line(f"lagros: not all was written or printed{_where_kept(kept)}")
+    elif not keep:
+        kept.remove()
+        if folder == BENCH_FOLDER:
+            remove_folders((folder.parent, folder))
+    delivery.tell()
+    raised = raised_line((row["policy"], row["raised"], row["episodes"]) for row in rows)
+    if not raised and any(row["timing_raised"] for row in rows):
+        raised = f"episodes raised where Δt was measured; exit status {RAISED}"
+    if raised:
+        typer.echo(f"lagros: {raised}", err=True)
+        raise typer.Exit(RAISED)
+    return rows
+
+
+def _where_kept(kept: Kept) -> str:
+    if not len(kept):
+        return ""
+    return f"; all that is finished is kept in {kept.folder}, and the same command goes on there"

@@ -1,0 +1,178 @@
+"""`lagros train`: reinforcement learning of our tasks with stable-baselines3.
+
+Only the standard library, typer and `terminal` are imported here; the command imports the rest.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lagros_benchmarks.commands.extras import check_extra
+from lagros_benchmarks.commands.outputs import Delivery, check_outputs
+from lagros_benchmarks.commands.terminal import fail, interrupted, listed
+
+if TYPE_CHECKING:
+    from lagros_benchmarks.training.settings import Training
+
+RUNS = Path("runs/train")
+# Files of a run, see `training.run.Place`.
+KEPT = ("record.json", "weights.safetensors", "checkpoint.pt")
+
+
+def train(
+    task: Annotated[str, typer.Argument(help="cartpole, or spacecraft (preset paper).")],
+    algo: Annotated[
+        str,
+        typer.Option(metavar="NAME[,NAME]", help="cartpole: of ppo, sac, td3. spacecraft: ppo."),
+    ] = "ppo",
+    seed: Annotated[
+        str,
+        typer.Option(metavar="N[,N]", help="Seeds; their episodes never occur in evaluation."),
+    ] = "0",
+    out: Annotated[
+        Path,
+        typer.Option(file_okay=False, help="Folder of the runs, TASK-ALGO/seed-N each."),
+    ] = RUNS,
+    segments: Annotated[
+        int | None,
+        typer.Option(help="Length of a run; each segment ends with a checkpoint."),
+    ] = None,
+    residual: Annotated[
+        float | None,
+        typer.Option(
+            metavar="NEWTONS",
+            help="cartpole: learn a correction of LAG-ROS of at most so much, 4 for instance.",
+        ),
+    ] = None,
+    parallel_env: Annotated[
+        bool,
+        typer.Option(
+            "--parallel-env",
+            help="spacecraft: rows from PettingZoo's environment; the same episodes, slower.",
+        ),
+    ] = False,
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Write events for TensorBoard beside each run.")
+    ] = False,
+    json: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", dir_okay=False, help="The learning curves of all runs."),
+    ] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", dir_okay=False, help="The same, drawn."),
+    ] = None,
+) -> None:
+    """Train agents, one after the other; go on where a run was killed, skip what is complete."""
+    from lagros_benchmarks.run.settings import check_task
+    from lagros_benchmarks.training.settings import default_training
+
+    try:
+        names = listed(algo, str, "--algo")
+        seeds = listed(seed, int, "--seed")
+        if not names or not seeds:
+            raise ValueError("--algo and --seed must not be empty")
+        for option, values in (("--algo", names), ("--seed", seeds)):
+            if len(set(values)) < len(values):
+                raise ValueError(f"{option} names a run twice; give each once")
+        if parallel_env and task != "spacecraft":
+            raise ValueError(f"--parallel-env is for spacecraft; leave it out for {task}")
+        if residual is not None and task != "cartpole":
+            raise ValueError(f"--residual is for cartpole; leave it out for {task}")
+        check_task(task)
+        changes: dict[str, Any] = {} if segments is None else {"segments": segments}
+        if residual is not None:
+            changes["largest_correction"] = residual
+        runs = [
+            replace(default_training(task, name), seed=number, **changes)
+            for number in seeds
+            for name in names
+        ]
+        if figure is not None:
+            from lagros_benchmarks.report.canvas import check_figure_path
+
+            check_figure_path(figure)
+        kept = [folder_of(run, out) / name for run in runs for name in KEPT]
+        check_outputs(
+            {**{f"--out ({path})": path for path in kept}, "--json": json, "--figure": figure}
+        )
+    except ValueError as error:
+        fail(str(error).replace("largest_correction", "--residual"))
+    _say_what_happens()
+    try:
+        records = [
+            _train_one(run, out, segments, residual, tensorboard, parallel_env) for run in runs
+        ]
+    except (ImportError, ValueError, OSError) as error:
+        # An extra that is not installed, a folder of another run, a full disk.
+        fail(error, status=1)
+    except KeyboardInterrupt:
+        interrupted(f"; the same command goes on with what is in {out}")
+    _write_curves(records, json, figure).tell()
+
+
+def folder_of(run: Training, out: Path) -> Path:
+    """Return the folder of a run."""
+    return out / f"{run.task}-{run.label}" / f"seed-{run.seed}"
+
+
+def _say_what_happens() -> None:
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(message)s")
+
+
+def _train_one(
+    run: Training,
+    out: Path,
+    segments: int | None,
+    residual: float | None,
+    tensorboard: bool,
+    parallel_env: bool,
+) -> dict[str, Any]:
+    check_extra("lagros train", "rl", "stable_baselines3")
+    import torch
+    from rich.console import Console
+
+    from lagros_benchmarks.training.lessons import lesson_of
+    from lagros_benchmarks.training.run import Place
+    from lagros_benchmarks.training.run import train as train_run
+    from lagros_benchmarks.training.table import final_table
+
+    # One thread: networks this small gain nothing from more, and the sums stay reproducible.
+    torch.set_num_threads(1)
+    place = Place(folder_of(run, out), tensorboard)
+    command = f"lagros train {run.task} --algo {run.algorithm.name} --seed {run.seed}"
+    command += "" if segments is None else f" --segments {segments}"
+    command += "" if residual is None else f" --residual {residual:g}"
+    record = train_run(run, place, lambda: lesson_of(run, parallel_env), command)
+    try:
+        table = final_table(record)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{place.record} is damaged ({type(error).__name__}: {error}); delete {place.folder}"
+        ) from error
+    typer.echo(f"{place.weights}, on held-out episodes:")
+    Console(highlight=False).print(table)
+    return record
+
+
+def _write_curves(
+    records: Sequence[dict[str, Any]], json: Path | None, figure: Path | None
+) -> Delivery:
+    delivery = Delivery()
+    if json is None and figure is None:
+        return delivery
+    from lagros_benchmarks.run.files import json_text
+    from lagros_benchmarks.run.surroundings import own_command
+    from lagros_benchmarks.training.curves import curves_of, draw
+
+    curves = curves_of(records, " ".join(own_command()))
+    delivery.write_text(json, lambda: json_text(curves))
+    delivery.write(figure, lambda path: draw(curves, path))
+    return delivery

@@ -1,0 +1,123 @@
+"""`lagros watch`: one episode as it moves, in a window or as a video.
+
+Only the standard library, typer and `terminal` are imported here; the command imports the rest.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lagros_benchmarks.commands.outputs import Delivery, check_outputs, policy_files
+from lagros_benchmarks.commands.terminal import fail, find_users_modules, refuse_options
+
+
+def watch(
+    task: Annotated[str, typer.Argument(help="cartpole or spacecraft.")],
+    policy: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="A policy of the task, a stable-baselines3 .zip, or module:Class.",
+        ),
+    ] = "lagros",
+    agents: Annotated[
+        int | None, typer.Option(help="Number of spacecraft; the preset's own if not given.")
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help="Of paper, released, crossing, open, swarm. (default: paper)"),
+    ] = None,
+    disturbance: Annotated[
+        str,
+        typer.Option(help="Of none, uniform, sphere, constant, sinusoid, gust."),
+    ] = "uniform",
+    bound: Annotated[
+        float | None,
+        typer.Option(
+            help="Bound d̄ of the disturbance, in units of the state per second. "
+            "(default: 0.75 for cartpole, 0.4 for spacecraft)"
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
+    scenario: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", dir_okay=False, help="A scenario as JSON, in place of the drawn one."
+        ),
+    ] = None,
+    safety_filter: Annotated[
+        bool, typer.Option("--safety-filter", help="Put the safety filter on the policy.")
+    ] = False,
+    video: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            dir_okay=False,
+            help="Write a .gif or .mp4 instead of opening a window.",
+        ),
+    ] = None,
+    speed: Annotated[
+        float | None,
+        typer.Option(
+            help="How much faster than real time it plays. (default: 1 for cartpole, 4 for "
+            "spacecraft)"
+        ),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="End after so many seconds of the episode.")
+    ] = None,
+) -> None:
+    """Watch one episode: agents, thrusters, sensing, tubes, goals, collisions.
+
+    Exit status 3: the policy raised, which ended the episode as a failure.
+    """
+    from lagros_benchmarks.report.playback import Playback, WatchSettings
+    from lagros_benchmarks.run.flying import RAISED
+    from lagros_benchmarks.run.library import SetupError
+    from lagros_envs.files import write_atomic
+
+    find_users_modules([policy])
+    try:
+        if disturbance == "none":
+            refuse_options(["--bound"], "no disturbance has a bound")
+        settings = WatchSettings(
+            task=task,
+            policy=policy,
+            agents=agents,
+            preset=preset,
+            disturbance=disturbance,
+            bound=bound,
+            seed=seed,
+            scenario=scenario,
+            safety_filter=safety_filter,
+            video=video,
+            speed=speed,
+            seconds=seconds,
+        )
+        playback = Playback(settings)
+        check_outputs({"--video": video}, {"--scenario": scenario, **policy_files([policy])})
+    except (ValueError, OSError) as error:
+        fail(error)
+    except (ImportError, SetupError) as error:
+        fail(error, status=1)
+    try:
+        film = playback.play()
+    except KeyboardInterrupt:
+        if video is not None:
+            raise
+        raise typer.Exit from None
+    except (ImportError, OSError, RuntimeError) as error:
+        fail(error, status=1)
+    finally:
+        playback.close()
+    delivery = Delivery()
+    content = film or b""
+    delivery.write(video, lambda path: write_atomic(path, content))
+    for line in playback.summary():
+        typer.echo(line)
+    delivery.tell(f"{playback.frames} frames, {len(content) / 1e6:.2g} MB")
+    if playback.error is not None:
+        raise typer.Exit(RAISED)

@@ -1,0 +1,1 @@
+"""What is behind a certified number: proofs, calibration, flights."""

@@ -1,0 +1,47 @@
+"""Which certified bound is about which flights: the one place that decides it.
+
+A number is published as certified only beside flights that its statement is about, under
+everything that the statement supposes.
+
+**Cart-pole: none.** Every flight holds its control for a period. Theorem 1 is for a control at
+will, for u* or what errs from it by a known eps_l, and for alpha - kappa d_theta / 2 in place of
+alpha, which is not positive at the bounds that are flown (`contraction.theorems`). The tubes that
+are proved for a held control (`contraction.held_design`) are those of another law around gentler
+plans. So the columns of the certified tube are null for every policy.
+
+**Spacecraft: the position's error to the plan of `centralized`**, under u* or the
+sliding-variable law, held, whatever the disturbance is within its bound (`position_margin`). It is
+proved of the double integrator of the plane: that the body turns within a hold is left out.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def position_margin(policy: Any, disturbance_bound: float) -> float | None:
+    """Return the certified bound of the position error to x_d, of a policy that tracks a plan [m].
+
+    Args:
+        policy: The policy as it flies, with whatever it wears. None is returned for all but the
+            centralised policy itself: a safety filter, a class derived from it or thrusters that
+            saturate apply another control than the one that the bound is for.
+        disturbance_bound: d_bar, in units of the state per second.
+    """
+    from lagros_policies.contraction.double_integrator import certified_margin
+    from lagros_policies.remarks.lagrangian import SlidingTracking, steady_position_bound
+    from lagros_policies.remarks.policies import SlidingCentralizedPolicy
+    from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
+    from lagros_policies.tasks.spacecraft.wrench_control import WrenchTracking
+
+    if type(policy) not in (CentralizedPolicy, SlidingCentralizedPolicy):
+        return None
+    if policy.settings.thrust_limit is not None:
+        return None
+    # The law may have been exchanged, by another of these two.
+    law: Any = policy.tracking
+    if type(law) is SlidingTracking:
+        return steady_position_bound(law.plane, disturbance_bound)
+    if type(law) is WrenchTracking:
+        return certified_margin(law.plane, disturbance_bound)
+    return None

@@ -1,0 +1,1 @@
+"""Rows, tables, figures and films of what was run."""

@@ -1,0 +1,157 @@
+"""What a run leaves behind: the files that were asked for, and the printed tables."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lagros_benchmarks.commands.outputs import Delivery, Paths, check_outputs
+from lagros_benchmarks.run.process import undone
+
+if TYPE_CHECKING:
+    from lagros_benchmarks.run.experiment import BenchmarkRun, Row
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Where the results of a run go; None leaves one out.
+
+    Attributes:
+        json: All figures of the run, a list with one object per policy and condition.
+        csv: The scalar ones.
+        latex: The table.
+        markdown: The table; success by condition if there are several.
+        figure: What is apt: the error or the success and effort of one condition, success and
+            effort of several, or success and time against the number of agents.
+        episodes: Every episode (of the spacecraft every agent), one JSON object a line.
+        scene: Trajectories of every policy in one world of spacecraft.
+        scene_world: Which world of the run that is, from 0.
+    """
+
+    json: Path | None = None
+    csv: Path | None = None
+    latex: Path | None = None
+    markdown: Path | None = None
+    figure: Path | None = None
+    episodes: Path | None = None
+    scene: Path | None = None
+    scene_world: int = 0
+
+    def check(
+        self,
+        task: str = "cartpole",
+        episodes: int | None = None,
+        inputs: Paths | None = None,
+        folders: Paths | None = None,
+        kept: Path | None = None,
+    ) -> None:
+        """Check the files before the run and not after it.
+
+        Args:
+            task: The task of the run.
+            episodes: Its number of episodes; None leaves the scene's world unchecked.
+            inputs: Files that the run reads, by the option that names them.
+            folders: Where it writes files of its own choice, likewise.
+            kept: Where it keeps its work if it can.
+
+        Raises:
+            ValueError: A file cannot be written, two are one, a figure has an unknown suffix, or
+                the task has no such scene.
+        """
+        for option in ("--figure", "--scene"):
+            path = self._paths[option]
+            if path is not None:
+                from lagros_benchmarks.report.figures import check_figure_path
+
+                try:
+                    check_figure_path(path)
+                except ValueError as error:
+                    raise ValueError(f"{option}: {error}") from None
+        if self.scene is not None:
+            if task != "spacecraft":
+                raise ValueError(f"scene: {task} has none; leave out --scene, or take spacecraft")
+            if episodes is not None and not 0 <= self.scene_world < episodes:
+                raise ValueError(
+                    f"scene_world={self.scene_world!r} must be one of the run's worlds, 0 to "
+                    f"{episodes - 1}"
+                )
+        check_outputs(self._paths, inputs, folders, kept)
+
+    @property
+    def some(self) -> bool:
+        """Whether a file is asked for."""
+        return any(path is not None for path in self._paths.values())
+
+    @property
+    def _paths(self) -> dict[str, Path | None]:
+        return {
+            "--json": self.json,
+            "--csv": self.csv,
+            "--latex": self.latex,
+            "--markdown": self.markdown,
+            "--episodes-file": self.episodes,
+            "--figure": self.figure,
+            "--scene": self.scene,
+        }
+
+    def write(self, run: BenchmarkRun, rows: list[Row]) -> Delivery:
+        """Write the files, each on its own, and return what came of it."""
+        from lagros_benchmarks.report import records, tables
+        from lagros_benchmarks.run import files
+
+        delivery = Delivery()
+        delivery.write_text(self.json, lambda: files.json_text(rows))
+        delivery.write_text(self.csv, lambda: tables.csv_text(rows))
+        delivery.write_text(self.latex, lambda: tables.latex_text(rows))
+        delivery.write_text(self.markdown, lambda: tables.markdown_text(rows))
+        delivery.write_text(
+            self.episodes, lambda: files.json_lines_text(records.episode_objects(run))
+        )
+        delivery.write(self.figure, lambda path: _draw(rows, path))
+        delivery.write(self.scene, lambda path: _draw_scene(run, self.scene_world, path))
+        return delivery
+
+
+def _draw(rows: list[Row], path: Path) -> None:
+    from lagros_benchmarks.report.figures import draw
+
+    draw(rows, path)
+
+
+def _draw_scene(run: BenchmarkRun, world: int, path: Path) -> None:
+    from lagros_benchmarks.run.runner import fly_scene
+    from lagros_benchmarks.tasks.spacecraft.scene_figure import scene_figure
+
+    # As in the run: what policies print is not ours, and where they go is no matter.
+    with redirect_stdout(sys.stderr), undone():
+        scene = fly_scene(run.settings, world)
+    scene_figure(scene, path)
+
+
+def print_report(rows: Sequence[Row]) -> None:
+    """Print the tables, the paired differences and what raised."""
+    from rich.console import Console
+    from rich.text import Text
+
+    from lagros_benchmarks.report import tables
+    from lagros_benchmarks.report.formats import by_condition
+
+    console = Console(highlight=False)
+    for group in by_condition(rows):
+        console.print(tables.terminal_table(group))
+        if group[0]["task"] == "spacecraft":
+            console.print()  # its tables have no frame, which ends in an empty line
+        for line in tables.comparison_lines(group):
+            # As text, here and below: names and units may hold what rich takes for markup.
+            console.print(Text(line))
+        console.print()
+    for title, table in tables.sweep_tables(rows):
+        console.print(Text(title))
+        console.print(table)
+        console.print()
+    for line in (tables.legend(rows), *tables.error_lines(rows)):
+        console.print(Text(line))

@@ -1,0 +1,228 @@
+"""One episode with frames of it, for `lagros watch`."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lagros_envs  # noqa: F401  (registers the environments)
+from lagros_benchmarks.report.video import FRAME_RATES, Frame, check_video_path, video_bytes
+from lagros_benchmarks.report.watched import CartPoleGame, SpacecraftGame
+from lagros_benchmarks.run.flying import Attempt
+from lagros_benchmarks.run.settings import check_policy, unknown_name
+from lagros_envs.canvas import import_pygame
+from lagros_envs.checks import (
+    check_disturbance_bound,
+    check_fields,
+    check_positive,
+    check_seed,
+    check_whole,
+)
+from lagros_envs.disturbances import KINDS
+from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS
+
+TASKS = ("cartpole", "spacecraft")
+BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
+SPEEDS = {"cartpole": 1.0, "spacecraft": 4.0}
+# Slower films would have pictures without end, faster ones none.
+SLOWEST, FASTEST = 0.05, 1000.0
+# "worst" needs a metric and a plan, which not every policy has.
+WATCHED_KINDS = tuple(kind for kind in KINDS if kind != "worst")
+_USE_VIDEO = "write a file with --video out.gif"
+_PAUSE = 1.5  # The last frame stays so long [s of the video].
+
+
+@dataclass(frozen=True)
+class WatchSettings:
+    """What to watch.
+
+    Attributes:
+        task: One of `TASKS`.
+        policy: A name of the task's policies, a stable-baselines3 zip, or module:Class.
+        agents: Number of spacecraft; None takes the scenario's or the preset's own.
+        preset: Of `lagros_envs.tasks.spacecraft.scenarios.PRESETS`; None takes "paper".
+        disturbance: Of `WATCHED_KINDS`.
+        bound: d_bar, in units of the state per second; None takes that of `BOUNDS`.
+        seed: Seed of the episode, as for `env.reset`.
+        scenario: File that `Scenario.save` has written; None draws one from the preset.
+        safety_filter: Whether the policy wears the safety filter.
+        video: File to write; None opens a window.
+        speed: How much faster than real time it plays; None takes that of `SPEEDS`.
+        seconds: End after so much time of the episode [s]; None plays to its end.
+
+    Raises:
+        ValueError: A value is not valid, or is of the other task.
+        ImportError: What writes the video is not installed.
+    """
+
+    task: str = "spacecraft"
+    policy: str = "lagros"
+    agents: int | None = None
+    preset: str | None = None
+    disturbance: str = "uniform"
+    bound: float | None = None
+    seed: int = 0
+    scenario: Path | None = None
+    safety_filter: bool = False
+    video: Path | None = None
+    speed: float | None = None
+    seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_fields(self)
+        if self.task not in TASKS:
+            raise ValueError(unknown_name("task", self.task, TASKS))
+        check_policy(self.policy, self.task)
+        if self.disturbance not in WATCHED_KINDS:
+            raise ValueError(unknown_name("disturbance", self.disturbance, WATCHED_KINDS))
+        if self.preset is not None and self.preset not in PRESETS:
+            raise ValueError(unknown_name("preset", self.preset, PRESETS))
+        if self.agents is not None:
+            check_whole("agents", self.agents, 1, MOST_AGENTS)
+        check_seed(self.seed)
+        if self.bound is not None:
+            check_disturbance_bound("bound", self.bound)
+        if self.speed is not None:
+            check_positive("speed", self.speed)
+            if not SLOWEST <= self.speed <= FASTEST:
+                raise ValueError(
+                    f"speed={self.speed!r} must be between {SLOWEST:g} and {FASTEST:g}"
+                )
+        if self.seconds is not None:
+            check_positive("seconds", self.seconds)
+        if self.task == "cartpole":
+            for name in ("agents", "preset", "scenario", "safety_filter"):
+                if getattr(self, name):
+                    option = name.replace("_", "-")
+                    raise ValueError(f"--{option} is of the spacecraft; leave it out for cartpole")
+        if self.video is not None:
+            check_video_path(self.video)
+
+    @property
+    def disturbance_bound(self) -> float:
+        """d_bar, given or the task's own."""
+        return BOUNDS[self.task] if self.bound is None else self.bound
+
+    @property
+    def playing_speed(self) -> float:
+        """How much faster than real time it plays, given or the task's own."""
+        return SPEEDS[self.task] if self.speed is None else self.speed
+
+
+class Playback:
+    """An environment and a policy in it, ready to play one episode.
+
+    What the policy raises ends the episode as a failure; what was flown until then is shown.
+
+    Args:
+        settings: What to watch.
+
+    Raises:
+        ValueError: The policy's name is unknown, or the scenario is not valid or does not fit.
+        OSError: The scenario cannot be read, or the policy has no weights.
+        ImportError: An extra that the policy needs is not installed.
+        SetupError: The constructor of a class of the user's own raises, or it cannot run.
+    """
+
+    def __init__(self, settings: WatchSettings) -> None:
+        """Build environment and policy."""
+        import_pygame()
+        self.settings = settings
+        self.frames = 0
+        self._game: CartPoleGame | SpacecraftGame = (
+            CartPoleGame(settings) if settings.task == "cartpole" else SpacecraftGame(settings)
+        )
+        task = self._game.env.settings
+        whole: int = task.steps
+        self._period: float = task.control_period
+        self._steps = whole
+        if settings.seconds is not None and settings.seconds < whole * self._period:
+            self._steps = max(1, math.ceil(settings.seconds / self._period - 1e-9))
+        per_second = settings.playing_speed / self._period  # control steps that a second shows
+        wanted = FRAME_RATES[".mp4" if settings.video is None else settings.video.suffix.lower()]
+        # Frames of a control step, or control steps of a frame.
+        self._parts = math.ceil(wanted / per_second - 1e-9) if self._game.divisible else 1
+        self._stride = max(1, math.floor(per_second / wanted + 1e-9))
+        self._rate = per_second * self._parts / self._stride
+
+    def play(self) -> bytes | None:
+        """Play the episode: film it, or show it in the window until it is closed.
+
+        Returns:
+            The content of the video, or None.
+
+        Raises:
+            ImportError: pygame is not installed.
+            RuntimeError: No window can be opened here.
+        """
+        if self.settings.video is not None:
+            kind = self.settings.video.suffix.lower()
+            return video_bytes(kind, self._drawn(), self._rate)
+        self._show()
+        return None
+
+    @property
+    def error(self) -> str | None:
+        """What the policy raised; None if nothing."""
+        return self._game.error
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._game.close()
+
+    def summary(self) -> list[str]:
+        """Return what happened up to now, a line each."""
+        settings = self.settings
+        title = f"{settings.policy} on seed {settings.seed}"
+        if settings.scenario is not None:
+            title += f" in {settings.scenario}"
+        title += f", {settings.disturbance}"
+        if settings.disturbance != "none":
+            title += f" d̄ = {settings.disturbance_bound:g}"
+        lines = [f"{title}: {self._game.outcome()}"]
+        counts: dict[str, int] = {}
+        with Attempt():
+            counts = self._game.counters()
+        if counts:
+            lines.append(", ".join(f"{name} {count}" for name, count in counts.items()))
+        if self.error is not None:
+            lines.append(f"the policy raised, which counts as a failure: {self.error}")
+        return lines
+
+    def _drawn(self) -> Iterator[Frame]:
+        self._game.start("rgb_array", self._rate)
+        for frame in self._frames():
+            yield frame
+        for _ in range(round(_PAUSE * self._rate)):
+            yield frame
+
+    def _show(self) -> None:
+        pygame = import_pygame()
+        try:
+            self._game.start("human", self._rate)
+        except pygame.error as error:
+            raise RuntimeError(f"no window can be opened here ({error}); {_USE_VIDEO}") from error
+        # Without a display SDL draws where nobody sees it, and says so in the driver's name alone.
+        if pygame.display.get_driver() == "offscreen" and "SDL_VIDEODRIVER" not in os.environ:
+            raise RuntimeError(f"no window can be opened here; {_USE_VIDEO}")
+        for _ in self._frames():
+            if pygame.event.get(pygame.QUIT):
+                break
+
+    def _frames(self) -> Iterator[Any]:
+        """Play the episode, and yield what is drawn of it: frames, or None from a window."""
+        self.frames = 1
+        yield self._game.draw(1.0)
+        for step in range(1, self._steps + 1):
+            over = self._game.step()
+            if step % self._stride == 0 or over or step == self._steps:
+                for part in range(1, self._parts + 1):
+                    self.frames += 1
+                    yield self._game.draw(part / self._parts)
+            if over:
+                break

@@ -1,0 +1,1 @@
+"""Episodes: settings, workers, one loop, what is kept."""

@@ -1,0 +1,148 @@
+"""What the chunks of a benchmark depend on, as one number."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib.util
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from lagros_benchmarks.run.library import Toolbox
+from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_benchmarks.run.surroundings import machine, threads, versions
+from lagros_policies.naming import is_file, model_file, user_class
+
+_PACKAGES = ("lagros_envs", "lagros_policies", "lagros_benchmarks")
+# Modules, weights and settings that a class of the user's own may read.
+_BESIDE = {
+    *(".py", ".npz", ".npy", ".pt", ".pth", ".safetensors", ".zip", ".onnx", ".h5"),
+    *(".json", ".yaml", ".yml", ".toml"),
+}
+# What changes no result; whether the work is done in parallel does, for it decides what is timed.
+_FREE = ("jobs", "backend")
+
+
+def fingerprint(settings: BenchmarkSettings, toolbox: Toolbox) -> str:
+    """Return a hash of all that the chunks of a run depend on.
+
+    These are the settings, the content of the files and modules that they name, our own code and
+    weights, the versions of what is installed, the threads and the processor: the last digit of a
+    product may depend on each.
+
+    Args:
+        settings: Those of the run.
+        toolbox: Where its policies and plans come from.
+    """
+    record = {name: value for name, value in asdict(settings).items() if name not in _FREE}
+    made_by = machine()
+    depends = {
+        "settings": record,
+        "parallel": settings.backend.in_parallel(settings.jobs),
+        "files": {text: _digest(files) for text, files in _named_files(record)},
+        "code": _own_code(),
+        "toolbox": [_origin(value) for value in vars(toolbox).values()],
+        "versions": versions(),
+        "threads": {name: value for name, value in threads().items() if name != "torch"},
+        "machine": [made_by["platform"], made_by["processor"]],
+    }
+    text = json.dumps(depends, sort_keys=True, default=repr)
+    return hashlib.sha256(text.encode(errors="backslashreplace")).hexdigest()
+
+
+def _named_files(value: Any) -> Iterator[tuple[str, list[Path]]]:
+    """Yield each text among some settings that names a file or a module, with its files."""
+    if isinstance(value, Mapping):
+        for item in (*value.keys(), *value.values()):
+            yield from _named_files(item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _named_files(item)
+    elif isinstance(value, str | Path):
+        text = str(value)
+        model = model_file(text)
+        path = Path(text) if model is None else model.path
+        if is_file(path):
+            yield text, [path]
+        elif (module := _module_named(text)) is not None:
+            yield text, _module_files(module)
+
+
+def _module_named(text: str) -> str | None:
+    """Return the module of module:Class; None if the text is something else."""
+    try:
+        named = user_class(text)
+    except ValueError:
+        return None
+    return None if named is None else named.module
+
+
+def _module_files(module: str) -> list[Path]:
+    """Return the files of a module, and those beside it, which it may import or read."""
+    try:
+        found = importlib.util.find_spec(module.partition(".")[0])
+    except (ImportError, ValueError):
+        return []
+    if found is None:
+        return []
+    if found.submodule_search_locations:
+        return [path for place in found.submodule_search_locations for path in _files(Path(place))]
+    if found.origin is None:
+        return []
+    place = Path(found.origin).parent
+    beside = [path for path in place.glob("*") if path.suffix in _BESIDE and path.is_file()]
+    return sorted({*beside, *_packages_beside(place, beside)})
+
+
+def _packages_beside(place: Path, modules: Iterable[Path]) -> Iterator[Path]:
+    """Yield the files of the folders of a place that modules import from."""
+    names: set[str] = set()
+    for module in modules:
+        if module.suffix == ".py":
+            # What is no Python is said where it is imported.
+            with suppress(OSError, SyntaxError, ValueError, RecursionError, MemoryError):
+                for node in ast.walk(ast.parse(module.read_bytes())):
+                    names |= _imported(node)
+    for name in names:
+        if (place / name).is_dir():
+            yield from _files(place / name)
+
+
+def _imported(node: ast.AST) -> set[str]:
+    """Return the packages that a statement imports from."""
+    if isinstance(node, ast.Import):
+        return {alias.name.partition(".")[0] for alias in node.names}
+    if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+        return {node.module.partition(".")[0]}
+    return set()
+
+
+def _files(folder: Path) -> list[Path]:
+    found = (path for path in folder.rglob("*") if "__pycache__" not in path.parts)
+    return sorted(path for path in found if path.is_file())
+
+
+@cache
+def _own_code() -> str:
+    return _digest(path for package in _PACKAGES for path in _module_files(package))
+
+
+def _digest(paths: Iterable[Path]) -> str:
+    digest = hashlib.sha256()
+    for path in paths:
+        try:
+            content = path.read_bytes()
+        except OSError:  # what nobody can read changes no result
+            continue
+        digest.update(f"{path.name} {len(content)} ".encode(errors="backslashreplace"))
+        digest.update(content)
+    return digest.hexdigest()
+
+
+def _origin(function: Any) -> str:
+    return f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', '')}"

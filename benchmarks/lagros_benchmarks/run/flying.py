@@ -1,0 +1,246 @@
+"""How a policy is asked, seeded and counted, and what becomes of what it raises.
+
+Every command flies policies through this module, whatever its loop. A policy is a stranger: it gets
+copies, its answers are checked, and whatever it raises is the failure of its episode. Only
+Ctrl-C ends the run, and so does a `KeyboardInterrupt` of the policy's own, which is the same to us.
+A call that never returns is waited for: there is no time limit on a policy.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable
+from time import perf_counter
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_benchmarks.run.library import Policy, SetupError, describe_error
+from lagros_benchmarks.run.process import ProcessState, undone
+from lagros_envs.seeding import episode_streams
+
+Float32Array = NDArray[np.float32]
+
+# Exit status of a command that has flown and written everything, where some episodes raised.
+RAISED = 3
+_INTERFACE = "predict(observation, state=None, episode_start=None, deterministic=True)"
+
+
+class AnswerError(ValueError):
+    """What `predict` returned is not an action of the right shape and a memory."""
+
+
+class Answer(NamedTuple):
+    """What a policy answered.
+
+    Attributes:
+        action: The action, a copy, in the first of the shapes that were asked for.
+        state: The policy's memory.
+        seconds: Time of the call with the conversion of its result [s].
+    """
+
+    action: Float32Array
+    state: Any
+    seconds: float
+
+
+class Attempt:
+    """A part of an episode whose exceptions are its failure: `with Attempt() as attempt: ...`.
+
+    Args:
+        passing: Exceptions that are not, and are raised as they are.
+
+    Attributes:
+        error: The exception on one line; None if there was none.
+    """
+
+    def __init__(self, *passing: type[BaseException]) -> None:
+        """Begin without an error."""
+        self.error: str | None = None
+        self._passing: tuple[type[BaseException], ...] = (KeyboardInterrupt, *passing)
+        self._process: ProcessState | None = None
+
+    def __enter__(self) -> Attempt:
+        """Begin."""
+        self._process = ProcessState()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> bool:
+        """Write an exception down, SystemExit too; let KeyboardInterrupt pass."""
+        if self._process is not None:
+            self._process.restore()
+        if error is None or isinstance(error, self._passing):
+            return False
+        self.error = describe_error(error)
+        return True
+
+
+def ask(
+    policy: Policy, observation: Any, state: Any, starts: Any, *shapes: tuple[int, ...]
+) -> Answer:
+    """Ask a policy for actions, and check what it answers.
+
+    Args:
+        policy: The policy; it gets copies of the arrays, to keep or to write into.
+        observation: Flat observation (o,), or a batch of them (B, o).
+        state: What the last call returned; None at the start.
+        starts: Which rows start an episode.
+        shapes: Shapes that the action may have; it is returned in the first.
+
+    Returns:
+        The answer.
+
+    Raises:
+        AnswerError: It is no pair, or its first part no array of numbers of one of these shapes.
+        ValueError: A number of it is not finite.
+    """
+    seen, first = np.array(observation), np.array(starts)
+    with np.errstate():  # a policy may set what NumPy raises, for itself
+        begin = perf_counter()
+        answer = policy.predict(seen, state, first, True)
+    if not isinstance(answer, tuple | list) or len(answer) != 2:
+        raise AnswerError(
+            f"predict returned {_said(answer)}; it must return a pair, the action and its memory "
+            "(None if it keeps none)"
+        )
+    action, memory = answer
+    # Numbers as they are and nothing else: text, objects and masks would be converted in silence.
+    if type(action) is not np.ndarray:
+        action = _array(action)
+    if action.dtype.kind not in "iuf":
+        raise AnswerError(f"predict returned {_said(action)} as its action; it must be numbers")
+    single = action
+    if action.dtype != np.float32:
+        with np.errstate(over="ignore"):  # it is then not finite, which is said below
+            single = action.astype(np.float32)
+    seconds = perf_counter() - begin
+    if single.shape not in shapes:
+        raise AnswerError(
+            f"predict answered observations of shape {seen.shape} by an action of shape "
+            f"{single.shape}; it must be {' or '.join(map(str, dict.fromkeys(shapes)))}"
+        )
+    if not np.isfinite(single).all():
+        at = np.flatnonzero(~np.isfinite(single.ravel()))[0]
+        raise ValueError(f"predict returned an action that is not finite: {single.ravel()[at]}")
+    # A copy: the policy may go on with its own array.
+    return Answer(np.array(single).reshape(shapes[0]), memory, seconds)
+
+
+def _array(action: Any) -> NDArray[Any]:
+    if isinstance(action, np.ma.MaskedArray):
+        raise AnswerError("predict returned a masked array as its action; it must be plain numbers")
+    try:
+        return np.asarray(action)
+    except (ValueError, TypeError) as error:
+        raise AnswerError(
+            f"predict returned {_said(action)} as its action, which is no array: {error}"
+        ) from None
+
+
+def _said(answer: Any) -> str:
+    """Return in a few words what was returned."""
+    if isinstance(answer, np.ndarray):
+        return f"an array of {answer.dtype} of shape {answer.shape}"
+    if isinstance(answer, tuple | list):
+        return f"a {type(answer).__name__} of {len(answer)} values"
+    return "None" if answer is None else f"a value of type {type(answer).__name__}"
+
+
+def reseed(policy: Policy, seed: int) -> None:
+    """Give a policy that draws the stream of an episode."""
+    draw = getattr(policy, "reseed", None)
+    if draw is not None:
+        draw(episode_streams(seed).policy)
+
+
+def counted(policy: Policy, state: Any) -> dict[str, int]:
+    """Return what a policy has counted in its memory; nothing for one that counts nothing."""
+    counters = getattr(policy, "counters", None)
+    if counters is None or state is None:
+        return {}
+    return {str(name): int(count) for name, count in counters(state).items()}
+
+
+def rehearse(
+    what: str, policy: Policy, observation: Any, starts: Any, *shapes: tuple[int, ...]
+) -> None:
+    """Ask a policy once before it flies, so that one that cannot run ends the command at once.
+
+    Its first call also loads what the timed ones need. Whatever else it raises here it will raise
+    in its episodes, where it is written down.
+
+    Args:
+        what: What to call it in a message, "policy 'mine:Lean'" for instance.
+        policy: The policy.
+        observation: An observation, or a batch of them.
+        starts: Which rows start an episode.
+        shapes: As for `ask`.
+
+    Raises:
+        SetupError: It has no `predict` that can be called as it must be, a package is missing, or
+            it answers by something that is no action of this task.
+    """
+    check_interface(what, policy)
+    try:
+        with undone():
+            reseed(policy, 0)
+            ask(policy, observation, None, starts, *shapes)
+    except (AnswerError, ImportError) as error:
+        raise SetupError(f"{what} cannot fly: {describe(error)}") from error
+    except KeyboardInterrupt:
+        raise
+    except BaseException:
+        return
+
+
+def describe(error: Exception) -> str:
+    """Return the text of an exception on one line, after its type unless it is ours."""
+    text = describe_error(error)
+    return text.partition(": ")[2] if isinstance(error, AnswerError) else text
+
+
+def check_interface(what: str, policy: Any) -> None:
+    """Check that a policy can be called as all are.
+
+    Raises:
+        SetupError: It cannot.
+    """
+    if inspect.isclass(policy):
+        raise SetupError(f"{what} is the class {policy.__name__}; it must be an object of it")
+    predict = getattr(policy, "predict", None)
+    if not callable(predict):
+        raise SetupError(f"{what} cannot fly: a {type(policy).__name__} has no method {_INTERFACE}")
+    try:
+        signature = inspect.signature(predict)
+    except (TypeError, ValueError):
+        return  # written in C, it does not tell
+    try:
+        signature.bind(None, None, None, True)
+    except TypeError as error:
+        raise SetupError(
+            f"{what} cannot fly: predict{signature} {error}; it must be {_INTERFACE}"
+        ) from None
+
+
+def raised_line(raised: Iterable[tuple[str, int, int]]) -> str:
+    """Return what a command says at its end of the episodes that raised; "" if none did.
+
+    Args:
+        raised: Name of the policy, number of episodes that raised and number of all, of each row.
+    """
+    counts: dict[str, list[int]] = {}
+    for name, count, total in raised:
+        before = counts.setdefault(name, [0, 0])
+        before[0] += count
+        before[1] += total
+    parts = [f"{name}: {count} of {total}" for name, (count, total) in counts.items() if count]
+    if not parts:
+        return ""
+    return f"episodes raised and count as failures ({'; '.join(parts)}); exit status {RAISED}"

@@ -1,0 +1,76 @@
+"""A task's experiment from nothing: what the runs of both tasks have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, TypeVar
+
+from lagros_benchmarks.run.experiment import Progress
+from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_policies.learning.shards import claim
+
+# Takes a line after each stage.
+Say = Callable[[str], None]
+Made = TypeVar("Made")
+
+
+class Reproduction(Protocol):
+    """All that the weights and the table of a task depend on; a dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the settings that may change when a run goes on: they change no file of it."""
+
+    def make(self, folder: Path, progress: Progress, say: Say) -> None:
+        """Make what is not yet in the folder."""
+
+    def benchmark(self, folder: Path | None) -> BenchmarkSettings:
+        """Return the benchmark of what lies in the folder; None takes what is shipped."""
+
+
+def made_before(read: Callable[[], Made], say: Say) -> Made | None:
+    """Return what a stage has left behind; None if it is not there, or damaged, which is said.
+
+    Args:
+        read: Reads the stage's file.
+        say: Takes a line.
+    """
+    try:
+        return read()
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        say(f"{error}; it is made again")
+        return None
+
+
+def reproduce(
+    folder: Path,
+    settings: Reproduction,
+    progress: Progress | None = None,
+    say: Say | None = None,
+) -> BenchmarkSettings:
+    """Make all that the policies of a task need; a run that was interrupted goes on.
+
+    Args:
+        folder: Where everything is kept.
+        settings: What to make.
+        progress: Called with a title, the units done and the units in all.
+        say: Called with a line after each stage.
+
+    Returns:
+        The benchmark of what was made, ready to run.
+
+    Raises:
+        ValueError: The folder holds a run of other settings.
+    """
+    folder = folder.absolute()
+    record = {name: value for name, value in asdict(settings).items() if name not in settings.free}
+    folder.mkdir(parents=True, exist_ok=True)
+    claim(folder / "settings.json", record, "a run")
+    settings.make(folder, progress or (lambda *_: None), say or (lambda _: None))
+    return settings.benchmark(folder)

@@ -1,0 +1,1 @@
+"""What the cart-pole adds to the benchmark."""

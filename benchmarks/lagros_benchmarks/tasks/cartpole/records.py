@@ -1,0 +1,188 @@
+"""From cart-pole episodes to the rows of a published table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from lagros_benchmarks.run.episodes import TUBE_TOLERANCE, EpisodeRecord, added_up
+from lagros_benchmarks.run.experiment import Row
+from lagros_benchmarks.run.library import FloatArray
+from lagros_benchmarks.run.metrics import (
+    carry_forward,
+    effort_ratio,
+    mean_interval,
+    paired_success_difference,
+    step_time_statistics,
+    wilson_interval,
+)
+from lagros_benchmarks.run.settings import Case
+from lagros_benchmarks.tasks.cartpole.experiment import CartPoleRun
+
+_BAND = (10.0, 90.0)  # percentiles of the tracking error over the episodes
+
+
+def rows(run: CartPoleRun) -> list[Row]:
+    """Return one row per policy and condition, without what the run ran on."""
+    return [
+        {
+            **_identity(run, case),
+            **_outcomes(records),
+            **_efforts(records),
+            **_times(run, case),
+            **_tracking(run, case),
+            "counters": added_up({**r.counters, **r.timed_counters} for r in records),
+            "raised": sum(record.error is not None for record in records),
+            "errors": [{"seed": r.seed, "text": r.error} for r in records if r.error is not None],
+            "versus": _versus(run, case),
+        }
+        for case, records in run.episodes.items()
+    ]
+
+
+def episode_objects(run: CartPoleRun) -> Iterable[dict[str, Any]]:
+    """Yield every episode as an object, without the time of each step."""
+    for records in run.episodes.values():
+        for record in records:
+            fields = asdict(record)
+            fields["counters"] |= fields.pop("timed_counters")
+            times = step_time_statistics(fields.pop("step_times"), record.deadline_misses)
+            yield {**fields, "step_time_median_s": times.median, "step_time_max_s": times.maximum}
+
+
+def _identity(run: CartPoleRun, case: Case) -> Row:
+    settings = run.settings
+    return {
+        "task": settings.task,
+        "policy": case.policy,
+        "disturbance": case.condition.kind,
+        "bound": case.condition.bound,
+        "channels": settings.channels,
+        "episodes": settings.episodes,
+        "seed": settings.seed,
+        "safety_filter": False,
+    }
+
+
+def _outcomes(records: Sequence[EpisodeRecord]) -> Row:
+    count = len(records)
+    successes = sum(record.success for record in records)
+    strict = sum(record.strict_success for record in records)
+    times = [r.success_time for r in records if r.success_time is not None]
+    return {
+        "success_rate": successes / count,
+        "success_ci95": wilson_interval(successes, count),
+        "strict_success_rate": strict / count,
+        "strict_success_ci95": wilson_interval(strict, count),
+        "fall_rate": sum(record.fallen for record in records) / count,
+        # Nothing to collide with on the cart's track.
+        "collision_rate": 0.0,
+        "success_time_median_s": float(np.median(times)) if times else None,
+    }
+
+
+def _efforts(records: Sequence[EpisodeRecord]) -> Row:
+    ran = [record for record in records if record.error is None]
+    efforts = [record.effort for record in ran]
+    return {
+        "effort_mean": float(np.mean(efforts)) if ran else None,
+        "effort_ci95": mean_interval(efforts),
+        "effort_total_mean": float(np.mean([r.effort_total for r in ran])) if ran else None,
+        "effort_episodes": len(ran),
+    }
+
+
+def _times(run: CartPoleRun, case: Case) -> Row:
+    timed = run.timing[case]
+    alone = _step_times(timed)
+    contended = None if run.timing is run.episodes else _step_times(run.episodes[case])
+    return {
+        **alone,
+        "step_time_episodes": len(timed),
+        "step_time_while_contended": contended,
+        "timing_raised": 0
+        if contended is None
+        else sum(record.error is not None for record in timed),
+        "forward_time_median_s": run.forward_times[case.policy],
+        "deadline_s": run.control_period,
+    }
+
+
+def _step_times(records: Sequence[EpisodeRecord]) -> Row:
+    statistics = step_time_statistics(
+        np.concatenate([record.step_times for record in records]),
+        sum(record.deadline_misses for record in records),
+    )
+    return {
+        "step_time_median_s": statistics.median,
+        "step_time_p99_s": statistics.p99,
+        "step_time_max_s": statistics.maximum,
+        "deadline_misses": statistics.deadline_misses,
+    }
+
+
+def _tracking(run: CartPoleRun, case: Case) -> Row:
+    records = run.episodes[case]
+    row: Row = {
+        "tube_violation_rate": sum(record.left_paper_tube for record in records) / len(records),
+        # No certified tube of ours is about these flights: see `claims`.
+        "certified_violation_rate": None,
+        "plans_failed": sum(plan.states is None for plan in run.plans),
+        "time_s": _rounded(run.times),
+        "paper_tube": _rounded(run.paper_tube),
+        "certified_tube": None,
+    }
+    measured = [r.tracking_error for r in records if r.max_tracking_error is not None]
+    row["tracking_episodes"] = len(measured)
+    if not measured:
+        return {
+            **row,
+            "tracking_error_mean_below_tube": False,
+            "mean_tracking_error": None,
+            "tracking_error_p10": None,
+            "tracking_error_p90": None,
+        }
+    curves = carry_forward(np.array(measured))
+    mean = curves.mean(axis=0)
+    low, high = np.percentile(curves, _BAND, axis=0, method="nearest")
+    raised = any(record.error is not None for record in records)
+    below = not raised and bool(np.all(mean <= run.paper_tube + TUBE_TOLERANCE))
+    return {
+        **row,
+        "tracking_error_mean_below_tube": below,
+        "mean_tracking_error": _rounded(mean),
+        "tracking_error_p10": _rounded(low),
+        "tracking_error_p90": _rounded(high),
+    }
+
+
+def _rounded(curve: FloatArray) -> list[float]:
+    # Six decimals are more than a curve is good for, and keep the files small.
+    return [round(float(value), 6) for value in curve]
+
+
+def _versus(run: CartPoleRun, case: Case) -> dict[str, Row]:
+    """Compare with every other policy on the same episodes."""
+    ours = run.episodes[case]
+    solved = [record.success for record in ours]
+    comparisons: dict[str, Row] = {}
+    for name in run.settings.policies:
+        if name == case.policy:
+            continue
+        theirs = run.episodes[Case(name, case.condition)]
+        their_solved = [record.success for record in theirs]
+        success = paired_success_difference(solved, their_solved)
+        effort = effort_ratio(
+            [r.effort for r in ours], solved, [r.effort for r in theirs], their_solved
+        )
+        comparisons[name] = {
+            "success_difference": success.difference,
+            "success_difference_ci95": success.interval,
+            "effort_ratio": None if effort is None else effort.ratio,
+            "effort_ratio_ci95": None if effort is None else effort.interval,
+            "episodes_both_solve": 0 if effort is None else effort.episodes,
+        }
+    return comparisons

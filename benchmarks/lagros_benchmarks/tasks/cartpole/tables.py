@@ -1,0 +1,98 @@
+"""What the tables of the cart-pole say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from lagros_benchmarks.report.formats import (
+    EFFORT_RATIO,
+    LONGEST_LABEL,
+    Column,
+    condition_title,
+    mark,
+    markdown_table,
+    milliseconds,
+    number,
+    percent,
+    policy_label,
+    row_label,
+    with_interval,
+)
+from lagros_benchmarks.run.experiment import Row
+
+_REFERENCES = ("tube-mpc", "lagros")
+
+LEGEND = (
+    "Success and strict success (inside the tube at the time limit, never fell) with 95 % "
+    "intervals; effort: mean integral of u² to success, else to the end; Δt: time of one call of "
+    "predict; left tube: episodes that fell, have no plan, or whose error x - x_d ever left the "
+    "paper's tube."
+)
+
+
+# Heading (two lines) and content of each column of the terminal and LaTeX tables.
+COLUMNS: tuple[Column, ...] = (
+    ("policy", "", row_label),
+    ("success", "%", lambda row: with_interval(row["success_rate"], row["success_ci95"])),
+    ("strict", "%", lambda row: percent(row["strict_success_rate"])),
+    ("effort", "N²s", lambda row: number(row["effort_mean"])),
+    ("Δt ms", "median", lambda row: milliseconds(row["step_time_median_s"])),
+    ("Δt ms", "p99", lambda row: milliseconds(row["step_time_p99_s"])),
+    ("left", "tube %", lambda row: percent(row["tube_violation_rate"])),
+)
+
+
+def title(row: Row) -> str:
+    """Return the title of the table of a condition."""
+    return f"{condition_title(row)}, {row['episodes']} episodes, seed {row['seed']}"
+
+
+def ordered(group: Sequence[Row]) -> Sequence[Row]:
+    """Return the rows of a condition as the table lists them."""
+    return group
+
+
+def comparison_lines(group: Sequence[Row]) -> Iterator[str]:
+    """Yield a line per policy: its paired difference from the planner (b), or from the first.
+
+    Args:
+        group: Rows of one condition.
+    """
+    names = [row["policy"] for row in group]
+    if len(names) < 2:
+        return
+    reference = next((name for name in _REFERENCES if name in names), names[0])
+    yield f"Against {policy_label(reference)} on the same episodes; {EFFORT_RATIO}:"
+    for row in group:
+        if row["policy"] != reference:
+            name = f"{policy_label(row['policy']):<{LONGEST_LABEL}}"
+            yield f"  {name} {_comparison(row, reference)}"
+
+
+def _comparison(row: Row, reference: str) -> str:
+    versus = row["versus"][reference]
+    low, high = versus["success_difference_ci95"]
+    text = (
+        f"success {100 * versus['success_difference']:+.1f} points "
+        f"({100 * low:+.1f} to {100 * high:+.1f})"
+    )
+    if versus["effort_ratio"] is not None:
+        text += f", effort × {versus['effort_ratio']:.3f}"
+    return text
+
+
+def markdown_grids(groups: Sequence[Sequence[Row]]) -> list[str]:
+    """Return success by condition, and (c) minus (b) on the same episodes."""
+    policies = [row["policy"] for row in groups[0]]
+    paired = {"lagros", "tube-mpc"} <= set(policies)
+    headings = ["disturbance", "d̄", *(f"{policy_label(name)} [%]" for name in policies)]
+    contents = []
+    for group in groups:
+        line = [group[0]["disturbance"], f"{group[0]['bound']:g}"]
+        line += [percent(row["success_rate"]) + mark(row) for row in group]
+        if paired:
+            ours = next(row for row in group if row["policy"] == "lagros")
+            change = ours["versus"]["tube-mpc"]["success_difference"]
+            line.append(f"{100 * change:+.1f}")
+        contents.append(line)
+    return [markdown_table([*headings, "(c) − (b) [points]"] if paired else headings, contents)]

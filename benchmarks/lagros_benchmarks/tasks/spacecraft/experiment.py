@@ -1,0 +1,239 @@
+"""The spacecraft's part of a benchmark: its worlds, its policies with and without the filter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from lagros_benchmarks.run.episodes import added_up
+from lagros_benchmarks.run.experiment import BenchmarkRun
+from lagros_benchmarks.run.flying import check_interface
+from lagros_benchmarks.run.library import FloatArray, Policy, Toolbox, building, check_observes
+from lagros_benchmarks.run.settings import BenchmarkSettings, Case
+from lagros_benchmarks.run.workers import Keeper, Progress
+from lagros_benchmarks.tasks.spacecraft.episodes import (
+    Flight,
+    Trace,
+    WorldRecord,
+    fly,
+    fly_chunk,
+    is_global,
+    rehearse_in,
+)
+from lagros_benchmarks.tasks.spacecraft.timing import PLAN_WORLDS, Timing, time_plans, time_policy
+from lagros_envs.tasks.spacecraft.scenarios import Scenario
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class SpacecraftRun(BenchmarkRun):
+    """All worlds of a spacecraft benchmark.
+
+    Attributes:
+        counters: What the policy of each case counts, summed over the worlds.
+    """
+
+    episodes: Mapping[Case, Sequence[WorldRecord]]
+    timing: Mapping[Case, Sequence[Timing]]
+    counters: Mapping[Case, Mapping[str, int]]
+
+
+@dataclass(frozen=True)
+class ScenePanel:
+    """One policy in the world of a scene.
+
+    Attributes:
+        case: The policy, and what it met.
+        path: Positions at every control instant, shape (instants, agents, 2) [m].
+        world: What happened.
+    """
+
+    case: Case
+    path: FloatArray
+    world: WorldRecord
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Several policies in the same world under the same disturbance.
+
+    Attributes:
+        scenario: Starts, goals and obstacles.
+        arena: Side of the square in which everything was placed [m].
+        goal_radius: Distance at which an agent has arrived [m].
+        control_period: Time between the instants of a path [s].
+        panels: One per policy.
+    """
+
+    scenario: Scenario
+    arena: float
+    goal_radius: float
+    control_period: float
+    panels: tuple[ScenePanel, ...]
+
+
+@dataclass(frozen=True)
+class SpacecraftExperiment:
+    """See `lagros_benchmarks.run.experiment.Experiment`."""
+
+    settings: BenchmarkSettings
+    toolbox: Toolbox
+    control_period: float
+
+    @classmethod
+    def set_up(cls, settings: BenchmarkSettings, toolbox: Toolbox) -> SpacecraftExperiment:
+        """Build everything once, so that a damaged file ends the run before it has begun.
+
+        Raises:
+            SetupError: A policy cannot be built or cannot run, or no scenario can be drawn.
+        """
+        experiment = cls(settings, toolbox, 0.0)
+        period = 0.0
+        rehearsed: set[str] = set()
+        # Beginning with the smallest worlds, of which one call is quick.
+        for case in sorted(settings.cases, key=lambda case: case.agents or 0):
+            with building(f"the environment of {case.agents} agents"):
+                env = experiment.environment(case, 1)
+                env.reset(seed=[0])
+                period = env.settings.control_period
+            policy = experiment.policy(case, env)
+            if case.policy not in rehearsed:
+                rehearsed.add(case.policy)
+                rehearse_in(env, case.policy, policy)
+        return cls(settings, toolbox, period)
+
+    @property
+    def timed_apart(self) -> bool:
+        """Always: a batch of worlds tells nothing about one decision."""
+        return True
+
+    def environment(self, case: Case, worlds: int) -> SpacecraftVectorEnv:
+        """Return worlds of a case."""
+        agents = case.agents or 1
+        return SpacecraftVectorEnv(
+            worlds * agents,
+            agents,
+            self.settings.preset or "paper",
+            case.condition.kind,
+            case.condition.bound,
+            "all" if self.settings.channels == "all" else "rates",
+            # The figures must not depend on whether numba is installed.
+            compiled=False,
+            autoreset_mode="disabled",
+        )
+
+    def policy(self, case: Case, env: SpacecraftVectorEnv) -> Policy:
+        """Build the policy of a case, with its filter.
+
+        Raises:
+            SetupError: It cannot be built.
+        """
+        name, bound = case.policy, case.condition.bound
+        given = self.settings.policy_settings.get(name, {})
+        with building(f"policy {name!r}"):
+            policy = self.toolbox.make_policy(name, env, given)
+        check_observes(f"policy {name!r}", policy)
+        if not case.safety_filter:
+            return policy
+        check_interface(f"policy {name!r}", policy)
+        with building(f"policy {name!r} with the safety filter"):
+            return self.toolbox.make_filter(policy, env, bound)
+
+    def units(self, progress: Progress | None, keeper: Keeper | None = None) -> list[int]:
+        """Return the seed of every world: each policy plans for itself."""
+        return self.settings.episode_seeds()
+
+    def play(self, case: Case, units: Sequence[int]) -> Flight:
+        """Fly a chunk of worlds."""
+        policy = self.policy(case, self.environment(case, 1))
+        margin = self._margin(policy, case)
+
+        def worlds(count: int) -> SpacecraftVectorEnv:
+            return self.environment(case, count)
+
+        return fly_chunk(worlds, policy, units, margin)
+
+    def time(self, case: Case, units: Sequence[int]) -> list[Timing]:
+        """Measure the times of the calls, and of more plans than those worlds need."""
+        env = self.environment(case, 1)
+        policy = self.policy(case, env)
+        rehearse_in(env, case.policy, policy)
+        timing = time_policy(env, policy, units)
+        if not is_global(policy):
+            return [timing]
+        further = self.settings.episode_seeds()[len(units) : PLAN_WORLDS]
+        plans = np.concatenate([timing.plans, time_plans(env, policy, further)])
+        return [replace(timing, plans=plans)]
+
+    def finish(
+        self,
+        units: Sequence[int],
+        outcomes: Mapping[Case, Sequence[Flight]],
+        timing: Mapping[Case, Any] | None,
+    ) -> SpacecraftRun:
+        """Put the run together."""
+        return SpacecraftRun(
+            settings=self.settings,
+            episodes={
+                case: [world for flight in flights for world in flight.worlds]
+                for case, flights in outcomes.items()
+            },
+            timing=timing or {},
+            control_period=self.control_period,
+            counters={
+                case: added_up(flight.counters for flight in flights)
+                for case, flights in outcomes.items()
+            },
+        )
+
+    def _margin(self, policy: Policy, case: Case) -> float | None:
+        return self.toolbox.position_margin(policy, case.condition.bound)
+
+
+def fly_scene(settings: BenchmarkSettings, world: int, toolbox: Toolbox) -> Scene:
+    """Fly one world of a run again with every policy, and keep where everybody was.
+
+    With several bounds or numbers of agents it is the middle one (the lower of two); with the
+    filter only where the run has no policy without it.
+
+    Args:
+        settings: Those of the run.
+        world: Which of its worlds, from 0.
+        toolbox: As for `run_benchmark`.
+
+    Raises:
+        ValueError: The run has no such world.
+    """
+    seeds = settings.episode_seeds()
+    if not 0 <= world < len(seeds):
+        raise ValueError(f"scene world {world} must be one of the run: 0 to {len(seeds) - 1}")
+    experiment = SpacecraftExperiment(settings, toolbox, 0.0)
+    agents = _middle(sorted(settings.agents))
+    condition = _middle(sorted(settings.conditions, key=lambda condition: condition.bound))
+    filtered = settings.cases[0].safety_filter
+    panels = []
+    for policy in settings.policies:
+        case = Case(policy, condition, filtered, agents)
+        env = experiment.environment(case, 1)
+        trace = Trace()
+        flight = fly(env, experiment.policy(case, env), [seeds[world]], None, trace, True)
+        panels.append(ScenePanel(case, np.array(trace.path)[:, 0], flight.worlds[0]))
+    scenario = env.scenarios[0]
+    if scenario is None:
+        raise RuntimeError("the world of the scene was not begun")
+    return Scene(
+        scenario,
+        env.preset.arena,
+        env.settings.goal_radius,
+        env.settings.control_period,
+        tuple(panels),
+    )
+
+
+def _middle(values: Sequence[Value]) -> Value:
+    return values[(len(values) - 1) // 2]

@@ -1,0 +1,228 @@
+"""From worlds of spacecraft to the rows of a published table.
+
+Rates are per agent. Agents of one world are not independent, so that beside Wilson's interval over
+agents stands one over worlds; comparisons and efforts have theirs over worlds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_benchmarks.run.experiment import Row
+from lagros_benchmarks.run.library import FloatArray
+from lagros_benchmarks.run.metrics import (
+    cluster_interval,
+    cluster_rate_interval,
+    paired_success_difference,
+    step_time_statistics,
+    wilson_interval,
+)
+from lagros_benchmarks.run.settings import Case
+from lagros_benchmarks.tasks.spacecraft.episodes import AgentRecord, WorldRecord
+from lagros_benchmarks.tasks.spacecraft.experiment import SpacecraftRun
+from lagros_benchmarks.tasks.spacecraft.timing import Timing
+
+BoolArray = NDArray[np.bool_]
+
+
+def rows(run: SpacecraftRun) -> list[Row]:
+    """Return one row per policy, filter, bound and number of agents; what it ran on is not in."""
+    return [
+        {
+            **_identity(run, case),
+            **_outcomes(worlds),
+            **_efforts(worlds),
+            **_times(run.timing[case], run.control_period),
+            **_tracking(worlds),
+            "counters": dict(run.counters[case]),
+            "raised": sum(world.error is not None for world in worlds),
+            "errors": [{"seed": w.seed, "text": w.error} for w in worlds if w.error is not None],
+            "versus": _versus(run, case),
+            "filter_effect": _filter_effect(run, case),
+        }
+        for case, worlds in run.episodes.items()
+    ]
+
+
+def agent_objects(run: SpacecraftRun) -> Iterable[dict[str, Any]]:
+    """Yield every agent of every world as an object."""
+    for case, worlds in run.episodes.items():
+        for world in worlds:
+            for index, agent in enumerate(world.agents):
+                yield {
+                    "policy": case.policy,
+                    "safety_filter": case.safety_filter,
+                    "disturbance": case.condition.kind,
+                    "bound": case.condition.bound,
+                    "agents": len(world.agents),
+                    "seed": world.seed,
+                    "agent": index,
+                    **asdict(agent),
+                    "planned": world.planned,
+                    "error": world.error,
+                }
+
+
+def _identity(run: SpacecraftRun, case: Case) -> Row:
+    settings = run.settings
+    return {
+        "task": settings.task,
+        "policy": case.policy,
+        "disturbance": case.condition.kind,
+        "bound": case.condition.bound,
+        "channels": settings.channels,
+        "preset": settings.preset,
+        "agents": case.agents,
+        "episodes": settings.episodes,
+        "seed": settings.seed,
+        "safety_filter": case.safety_filter,
+    }
+
+
+def _flags(worlds: Sequence[WorldRecord], what: Callable[[AgentRecord], Any]) -> BoolArray:
+    """Return a flag of every agent, shape (worlds, agents)."""
+    return np.array([[bool(what(agent)) for agent in world.agents] for world in worlds])
+
+
+def _numbers(worlds: Sequence[WorldRecord], what: Callable[[AgentRecord], float]) -> FloatArray:
+    """Return a number of every agent, shape (worlds, agents)."""
+    return np.array([[what(agent) for agent in world.agents] for world in worlds])
+
+
+def _rate(name: str, flags: BoolArray) -> Row:
+    """Return a rate over agents with both of its intervals."""
+    return {
+        f"{name}_rate": float(flags.mean()),
+        f"{name}_ci95": wilson_interval(int(flags.sum()), flags.size),
+        f"{name}_world_ci95": cluster_rate_interval(
+            flags.sum(axis=1).tolist(), np.full(len(flags), flags.shape[1]).tolist()
+        ),
+    }
+
+
+def _outcomes(worlds: Sequence[WorldRecord]) -> Row:
+    times = [a.success_time for w in worlds for a in w.agents if a.success_time is not None]
+    success = _flags(worlds, lambda agent: agent.success)
+    planned = [world.planned for world in worlds]
+    with_plan = np.array([bool(one) for one in planned])
+    row: Row = {
+        **_rate("success", success),
+        **_rate("strict_success", _flags(worlds, lambda agent: agent.strict_success)),
+        **_rate("paper_success", _flags(worlds, lambda agent: agent.paper_success)),
+        **_rate("collision", _flags(worlds, lambda agent: agent.collided)),
+        "world_success_rate": float(success.all(axis=1).mean()),
+        "success_time_median_s": float(np.median(times)) if times else None,
+        "plan_rate": None if None in planned else float(with_plan.mean()),
+        "success_rate_where_planned": None,
+    }
+    if None not in planned and with_plan.any():
+        row["success_rate_where_planned"] = float(success[with_plan].mean())
+    return row
+
+
+def _efforts(worlds: Sequence[WorldRecord]) -> Row:
+    """Efforts of all agents but those whose world raised before they had succeeded."""
+    whole = np.array([world.error is None for world in worlds])
+    known = whole[:, None] | _flags(worlds, lambda agent: agent.success)
+    efforts = np.where(known, _numbers(worlds, lambda agent: agent.effort), 0.0)
+    solved = _flags(worlds, lambda agent: agent.success)
+    totals = _numbers(worlds, lambda agent: agent.effort_total)[whole]
+    return {
+        "effort_mean": float(efforts.sum() / known.sum()) if known.any() else None,
+        "effort_ci95": cluster_interval(efforts.sum(axis=1), known.sum(axis=1)),
+        "effort_of_successes_mean": float(efforts[solved].mean()) if solved.any() else None,
+        "effort_total_mean": float(totals.mean()) if totals.size else None,
+        "effort_agents": int(known.sum()),
+    }
+
+
+def _times(timings: Sequence[Timing], deadline: float) -> Row:
+    steps, batches, plans = (
+        np.concatenate([getattr(timing, name) for timing in timings])
+        for name in ("steps", "batches", "plans")
+    )
+    agents = timings[0].agents
+    # Whoever plans for all at the start has planned by the first deadline, or missed it.
+    calls = batches if plans.size else steps
+    misses = int(np.count_nonzero(calls > deadline))
+    alone = step_time_statistics(steps, 0)
+    planning = step_time_statistics(plans, 0)
+    return {
+        "step_time_median_s": alone.median,
+        "step_time_p99_s": alone.p99,
+        "step_time_max_s": alone.maximum,
+        "step_time_of": "all agents" if plans.size else "one agent",
+        "step_time_batch_per_agent_s": float(np.median(batches)) / agents if batches.size else None,
+        "plan_time_median_s": planning.median if plans.size else None,
+        "plan_time_p99_s": planning.p99 if plans.size else None,
+        "plan_time_max_s": planning.maximum if plans.size else None,
+        "plans_timed": int(plans.size),
+        "steps_timed": int(steps.size),
+        "timing_raised": sum(timing.raised for timing in timings),
+        "deadline_s": deadline,
+        "deadline_misses": step_time_statistics(calls, misses).deadline_misses,
+    }
+
+
+def _tracking(worlds: Sequence[WorldRecord]) -> Row:
+    """Share of agents that left the tubes around x_d; None where there is no x_d."""
+    agents = [agent for world in worlds for agent in world.agents]
+    paper = [a.left_paper_tube for a in agents if a.left_paper_tube is not None]
+    certified = [a.left_certified_tube for a in agents if a.left_certified_tube is not None]
+    errors = [a.max_position_error for a in agents if a.max_position_error is not None]
+    return {
+        "tube_violation_rate": float(np.mean(paper)) if paper else None,
+        "certified_violation_rate": float(np.mean(certified)) if certified else None,
+        "position_error_max_median": float(np.median(errors)) if errors else None,
+        "position_error_max_p95": float(np.percentile(errors, 95.0)) if errors else None,
+    }
+
+
+def _versus(run: SpacecraftRun, case: Case) -> dict[str, Row]:
+    """Compare with every other policy on the same agents, filtered alike."""
+    return {
+        name: _comparison(run.episodes[case], run.episodes[case._replace(policy=name)])
+        for name in run.settings.policies
+        if name != case.policy
+    }
+
+
+def _filter_effect(run: SpacecraftRun, case: Case) -> Row | None:
+    """Compare a policy that wears the filter with itself without, on the same agents."""
+    bare = case._replace(safety_filter=False)
+    if not case.safety_filter or bare not in run.episodes:
+        return None
+    return _comparison(run.episodes[case], run.episodes[bare])
+
+
+def _comparison(ours: Sequence[WorldRecord], theirs: Sequence[WorldRecord]) -> Row:
+    """Return the difference in success and the ratio of efforts of the agents that both solve."""
+    mine = _flags(ours, lambda agent: agent.success)
+    other = _flags(theirs, lambda agent: agent.success)
+    success = paired_success_difference(mine.ravel().tolist(), other.ravel().tolist())
+    counts = np.full(len(mine), mine.shape[1])
+    change = (mine.astype(int) - other.astype(int)).sum(axis=1)
+    # Where all worlds differ alike, resampling them shows no spread: the interval over agents then
+    # stands for both.
+    alike = bool(np.all(change == change[0]))
+    both = mine & other
+    spent = np.where(both, _numbers(ours, lambda agent: agent.effort), 0.0)
+    reference = np.where(both, _numbers(theirs, lambda agent: agent.effort), 0.0)
+    measurable = reference.sum() > 0.0
+    return {
+        "success_difference": success.difference,
+        "success_difference_ci95": success.interval,
+        "success_difference_world_ci95": success.interval
+        if alike
+        else cluster_interval(change, counts),
+        "effort_ratio": float(spent.sum() / reference.sum()) if measurable else None,
+        "effort_ratio_ci95": cluster_interval(spent.sum(axis=1), reference.sum(axis=1))
+        if measurable
+        else None,
+        "agents_both_solve": int(both.sum()),
+    }

@@ -1,0 +1,271 @@
+"""The spacecraft experiment from nothing: expert flights, networks (a) and (c), their benchmark.
+
+The networks of (c) are fitted in rounds: the first to flights of the expert, each later one also to
+what the one before it met when it flew, labelled by the expert (DAgger). Every stage leaves its
+files in the run's folder and is skipped where they are whole. The same settings give the same
+files, bit for bit on one machine.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any, ClassVar
+
+import numpy as np
+
+from lagros_benchmarks.run.experiment import Progress
+from lagros_benchmarks.run.reproduction import Say, made_before
+from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_envs.checks import check_fields
+from lagros_envs.files import write_atomic
+from lagros_envs.tasks.spacecraft.scenarios import preset_named
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_policies.backends import LOKY, Backend
+from lagros_policies.learning.deep_set import DeepSet
+from lagros_policies.learning.train_deep_set import (
+    DeepSetTraining,
+    SetSamples,
+    fit_deep_set,
+    flight_samples,
+    join,
+)
+from lagros_policies.tasks.spacecraft.expert import SpacecraftExpertSettings
+from lagros_policies.tasks.spacecraft.flights import FlightData, FlightSettings, fly_expert
+from lagros_policies.tasks.spacecraft.sensed import Sensed
+from lagros_policies.trained_for import PUBLISHED, spacecraft_range, weights_record
+
+BOUNDS = (0.2, 0.4, 0.6, 0.8, 1.0)
+_RELABELLED = "relabelled"
+# Who is slow here is at rest, and not at the start or the goal.
+_FAR = 0.4  # [m]
+_UNDER_WAY = 2.0  # [s]
+
+
+def _rounds() -> tuple[FlightSettings, ...]:
+    # The network knows no plan, only what is near: stiffer labels make up for that.
+    stiff = SpacecraftExpertSettings(contraction_rate=3.0, start_weight=0.25)
+    # One round: in later ones agents come to rest, and labels that would move them left or right
+    # add up to nothing (docs/results-spacecraft.md).
+    return (FlightSettings(worlds=800, replan_period=4.0, expert=stiff, seed=11),)
+
+
+@dataclass(frozen=True)
+class SpacecraftReproduceSettings:
+    """All that the weights and the table depend on.
+
+    Attributes:
+        flights: Flights of the expert under disturbance.
+        calm: Its flights without, which (a) imitates.
+        rounds: Flights of one network after the other, labelled by the expert.
+        relabelled_weight: How often the samples of these flights count, others once.
+        label_limit: Longer labels of these flights are shortened to this [m/s^2]: a plan that
+            begins well beside an agent asks for more than it takes to get there.
+        least_speed: Samples of these flights of agents slower than this [m/s], under way and far
+            from the goal, are left out: rest has no side, and teaches to rest.
+        held_out: Share of the worlds of the last round whose samples are never trained on.
+        intermediate: Training of the networks that fly.
+        lagros: Training of (c).
+        learned: Training of (a).
+        worlds: Paired worlds of the table at each bound.
+        bounds: d_bar of the table, uniform in the ball.
+        seed: Seed of the table.
+        jobs: Processes; they change no result.
+        backend: Whose processes they are; those of a cluster must see the run's folder.
+
+    Raises:
+        ValueError: A setting of the table is not valid.
+    """
+
+    flights: FlightSettings = field(
+        default_factory=lambda: FlightSettings(worlds=2000, sample_every=12, seed=0)
+    )
+    calm: FlightSettings = field(
+        default_factory=lambda: FlightSettings(worlds=300, disturbance_bound=0.0, seed=1)
+    )
+    rounds: tuple[FlightSettings, ...] = field(default_factory=_rounds)
+    relabelled_weight: int = 3
+    label_limit: float = 2.0
+    least_speed: float = 0.12
+    held_out: float = 0.1
+    intermediate: DeepSetTraining = field(default_factory=DeepSetTraining)
+    lagros: DeepSetTraining = field(default_factory=DeepSetTraining)
+    learned: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=4))
+    worlds: int = 20
+    bounds: tuple[float, ...] = BOUNDS
+    seed: int = 0
+    jobs: int = 2
+    backend: Backend = LOKY
+    free: ClassVar[tuple[str, ...]] = ("jobs", "backend", "worlds", "seed", "bounds")
+
+    def __post_init__(self) -> None:
+        """Check, before hours of work, what the benchmark at their end will ask."""
+        check_fields(self)
+        self.benchmark(None)
+
+    def make(self, folder: Path, progress: Progress, say: Say) -> None:
+        """Make expert flights and networks; see `reproduction.reproduce`."""
+        stage = _Stage(folder, self, progress, say)
+        calm = stage.fly("calm flights", self.calm, None)
+        stage.fit("learned", self.learned, [calm], calm)
+        parts = [stage.fly("flights", self.flights, None)]
+        learner = stage.fit("round0", self.intermediate, parts, parts[0])
+        for index, flights in enumerate(self.rounds, start=1):
+            met = stage.fly(f"{_RELABELLED}{index}", flights, learner)
+            kept = training_part(met, self)
+            parts += [kept] * self.relabelled_weight
+            last = index == len(self.rounds)
+            name, training = (
+                ("lagros", self.lagros) if last else (f"round{index}", self.intermediate)
+            )
+            learner = stage.fit(name, training, parts, _held_out_part(met, self.held_out))
+
+    def benchmark(self, folder: Path | None) -> BenchmarkSettings:
+        """Return the benchmark of (a), (b), (c) and (d).
+
+        Args:
+            folder: Where the weights lie; None takes the shipped ones.
+        """
+        weights = {}
+        if folder is not None:
+            weights = {name: {"weights": str(_weights(folder, name))} for name in _NETWORKS}
+        return BenchmarkSettings.for_task(
+            "spacecraft",
+            episodes=self.worlds,
+            bounds=self.bounds,
+            seed=self.seed,
+            policy_settings=weights,
+            jobs=self.jobs,
+            backend=self.backend,
+            # Tube MPC takes most of the time of a timing pass, which is serial.
+            timing_episodes=2,
+        )
+
+
+_NETWORKS = ("lagros", "learned")
+
+
+@dataclass
+class _Stage:
+    """The stages of one run, each resumable."""
+
+    folder: Path
+    settings: SpacecraftReproduceSettings
+    progress: Progress
+    say: Say
+    task: SpacecraftSettings = field(default_factory=SpacecraftSettings)
+
+    def fly(self, name: str, flights: FlightSettings, learner: Path | None) -> FlightData:
+        """Fly and label."""
+        begun = perf_counter()
+        data = fly_expert(
+            self.folder / name.replace(" ", "_"),
+            flights,
+            self.task,
+            learner,
+            self.settings.jobs,
+            lambda done: self.progress(name, done, flights.shards),
+            self.settings.backend,
+        )
+        self.say(
+            f"{name} ({perf_counter() - begun:.0f} s): {len(data.observation)} samples in "
+            f"{flights.worlds} worlds, {data.failed_plans} of {data.plans} plans failed"
+        )
+        return data
+
+    def fit(
+        self, name: str, training: DeepSetTraining, parts: list[FlightData], test: FlightData
+    ) -> Path:
+        """Fit one network, unless its file is whole, and write its record beside it."""
+        weights = _weights(self.folder, name)
+        begun = perf_counter()
+        if made_before(lambda: DeepSet.load(weights), self.say) is None:
+            samples = join([self._samples(part) for part in parts])
+            network = fit_deep_set(
+                samples,
+                training,
+                self.folder / f"{name}_checkpoint.safetensors",
+                lambda epoch, _: self.progress(f"fit {name}", epoch, training.epochs),
+            )
+            trained_for = spacecraft_range(self.task, PUBLISHED)
+            network.metadata.update(weights_record("spacecraft", name, trained_for))
+            network.save(weights)
+        fitted = DeepSet.load(weights)
+        error = _learning_error(fitted, self._samples(test))
+        record = {
+            "policy": name,
+            "command": "lagros reproduce spacecraft",
+            "training": asdict(training),
+            "samples": sum(len(part.observation) for part in parts),
+            "weights": fitted.weights,
+            "learning_error": error,
+        }
+        write_atomic(weights.with_suffix(".json"), json.dumps(record, indent=1) + "\n")
+        self.say(
+            f"{name} ({perf_counter() - begun:.0f} s): error of the acceleration, mean "
+            f"{error['mean']:.3g}, p99 {error['p99']:.3g} m/s² on {error['samples']} samples"
+        )
+        return weights
+
+    def _samples(self, data: FlightData) -> SetSamples:
+        preset = preset_named(self.settings.flights.preset)
+        return flight_samples(data, self.task, preset.agent_radius, preset.core)
+
+
+def _weights(folder: Path, name: str) -> Path:
+    return folder / f"spacecraft_{name}.safetensors"
+
+
+def _learning_error(network: DeepSet, samples: SetSamples) -> dict[str, Any]:
+    """Return ||a_L - a*|| in the plane, observed; the labels of one observation scatter."""
+    distance = np.linalg.norm(network(samples.features) - samples.target, axis=-1)
+    return {
+        "mean": float(distance.mean()),
+        "p99": float(np.quantile(distance, 0.99)),
+        "maximum": float(distance.max()),
+        "label_mean": float(np.linalg.norm(samples.target, axis=-1).mean()),
+        "samples": len(distance),
+        "unit": "m/s^2",
+        "kind": "observed",
+    }
+
+
+def _split(data: FlightData, share: float) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    every = max(2, round(1.0 / share))
+    return np.asarray(data.world % every == 0)
+
+
+def training_part(data: FlightData, settings: SpacecraftReproduceSettings) -> FlightData:
+    """Return what is learned from flights of a network: labels of a sane size, nobody at rest.
+
+    Args:
+        data: The flights, labelled.
+        settings: Which labels are too long, who is at rest, and what is held out.
+    """
+    sensed = Sensed.of(data.layout, data.observation)
+    slow = np.linalg.norm(sensed.velocity, axis=-1) < settings.least_speed
+    far = np.linalg.norm(sensed.goal, axis=-1) > _FAR
+    resting = slow & far & (sensed.time > _UNDER_WAY)
+    kept = _only(data, ~_split(data, settings.held_out) & ~resting)
+    size = np.linalg.norm(kept.acceleration[:, :2], axis=-1, keepdims=True)
+    share = np.minimum(1.0, settings.label_limit / np.maximum(size, 1e-9)).astype(np.float32)
+    turn = kept.acceleration[:, 2:]
+    label = np.concatenate([kept.acceleration[:, :2] * share, turn], axis=-1)
+    return replace(kept, acceleration=label)
+
+
+def _held_out_part(data: FlightData, share: float) -> FlightData:
+    return _only(data, _split(data, share))
+
+
+def _only(data: FlightData, chosen: np.ndarray[Any, np.dtype[np.bool_]]) -> FlightData:
+    return FlightData(
+        data.observation[chosen],
+        data.acceleration[chosen],
+        data.world[chosen],
+        data.layout,
+        data.plans,
+        data.failed_plans,
+    )

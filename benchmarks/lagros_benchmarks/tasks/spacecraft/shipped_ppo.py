@@ -1,0 +1,53 @@
+"""The run behind the shipped `ppo`.
+
+    python -m lagros_benchmarks.tasks.spacecraft.shipped_ppo --seed 0
+
+Ten times as long as that of `lagros train cartpole --algo ppo`, and otherwise the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from lagros_benchmarks.tasks.cartpole.training import CartPoleLesson
+from lagros_benchmarks.training.run import Place, train
+from lagros_benchmarks.training.settings import CartPoleTraining
+
+SHIPPED = CartPoleTraining(segments=40, segment_steps=1800, curve_episodes=500, final_episodes=2000)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Train from the command line.
+
+    Args:
+        arguments: The arguments; None for those of the process.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m lagros_benchmarks.tasks.spacecraft.shipped_ppo",
+        description="Train the shipped PPO actor of the cart-pole. Started again after an "
+        "interruption, it goes on from the last checkpoint.",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the run (default: 0)")
+    parser.add_argument(
+        "--out", type=Path, help="folder of the run (default: runs/train/shipped-ppo/seed-SEED)"
+    )
+    options = parser.parse_args(arguments)
+    if options.seed < 0:
+        parser.error("--seed must be >= 0")
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(message)s")
+    torch.set_num_threads(1)
+    run = replace(SHIPPED, seed=options.seed)
+    folder = options.out or Path("runs/train/shipped-ppo") / f"seed-{options.seed}"
+    command = f"python -m lagros_benchmarks.tasks.spacecraft.shipped_ppo --seed {options.seed}"
+    train(run, Place(folder), lambda: CartPoleLesson(run), command)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,223 @@
+"""What the tables of the spacecraft say."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+
+from lagros_benchmarks.report.formats import (
+    EFFORT_RATIO,
+    Column,
+    agents_title,
+    condition_title,
+    disturbance_title,
+    mark,
+    markdown_table,
+    milliseconds,
+    number,
+    percent,
+    policy_label,
+    short_label,
+    signed,
+    task_title,
+    with_interval,
+)
+from lagros_benchmarks.run.experiment import Row
+
+LEGEND = (
+    "Rates are per agent. Success: within 0.2 m of the goal before 45 s and any collision, with a "
+    "95 % interval over worlds; strict: there at the end, never collided; paper: inside the "
+    "paper's tube around the goal; coll.: collided, ever. ∫‖u‖²: mean effort of an agent to "
+    "success, else to the end. Δt: one agent's decision; of a policy that plans for all agents "
+    "together, that plan."
+)
+_LABEL = 15
+_WIDTH = 80
+_MOST_COLUMNS = 5  # of a sweep beside each other
+_BELOW = "  + filter"
+
+
+def plan_or_step(row: Row, statistic: str) -> float | None:
+    """Return the Δt that the paper compares: of a joint plan, or of one agent's decision [s]."""
+    plan: float | None = row[f"plan_time_{statistic}_s"]
+    return row[f"step_time_{statistic}_s"] if plan is None else plan
+
+
+def _label(row: Row) -> str:
+    # A policy without filter stands in the line above, unless the run has none.
+    below = row["filter_effect"] is not None
+    return _BELOW if below else policy_label(row["policy"], _LABEL)
+
+
+def _effort(row: Row) -> str:
+    effort = row["effort_mean"]
+    # Three decimals are enough beside the efforts of a whole table.
+    return f"{effort:.3f}" if effort is not None and effort < 1.0 else number(effort)
+
+
+# Heading (two lines) and content of each column of the terminal and LaTeX tables.
+COLUMNS: tuple[Column, ...] = (
+    ("policy", "", lambda row: _label(row) + mark(row)),
+    ("success", "%", lambda row: with_interval(row["success_rate"], row["success_world_ci95"])),
+    ("strict", "%", lambda row: percent(row["strict_success_rate"])),
+    ("paper", "%", lambda row: percent(row["paper_success_rate"])),
+    ("coll.", "%", lambda row: percent(row["collision_rate"])),
+    ("∫‖u‖²", "N²s", _effort),
+    ("Δt ms", "p50", lambda row: milliseconds(plan_or_step(row, "median"))),
+    ("Δt ms", "p99", lambda row: milliseconds(plan_or_step(row, "p99"))),
+)
+
+
+def title(row: Row) -> str:
+    """Return the title of the table of a condition, on two lines; the row is its first."""
+    worlds = f"{row['episodes']} world{'' if row['episodes'] == 1 else 's'}, seed {row['seed']}"
+    worlds += ", all with the safety filter" if row["safety_filter"] else ""
+    return f"{task_title(row)}, {disturbance_title(row)},\n{worlds}"
+
+
+def ordered(group: Sequence[Row]) -> Sequence[Row]:
+    """Return the rows of a condition as the table lists them: the filter below its policy."""
+    names = list(dict.fromkeys(row["policy"] for row in group))
+    return sorted(group, key=lambda row: (names.index(row["policy"]), row["safety_filter"]))
+
+
+def comparison_lines(group: Sequence[Row]) -> Iterator[str]:
+    """Yield how each policy differs from the next one, filtered alike, and what the filter does.
+
+    Args:
+        group: Rows of one condition.
+    """
+    for filtered in (False, True):
+        rows = [row for row in group if row["safety_filter"] is filtered]
+        if len(rows) > 1:
+            which = "with" if filtered else "without"
+            yield f"On the same agents, {which} the filter; {EFFORT_RATIO}:"
+        for row, following in itertools.pairwise(rows):
+            names = f"{short_label(row['policy'])} − {short_label(following['policy'])}"
+            yield from _comparison(names, row["versus"][following["policy"]])
+    effects = [row for row in group if row["filter_effect"] is not None]
+    if effects:
+        yield f"What the filter changes; {EFFORT_RATIO}:"
+    for row in effects:
+        yield from _comparison(policy_label(row["policy"], _LABEL), row["filter_effect"])
+
+
+def _comparison(names: str, versus: Row) -> Iterator[str]:
+    low, high = (100 * end for end in versus["success_difference_world_ci95"])
+    text = (
+        f"  {names}: {signed(100 * versus['success_difference'])} points "
+        f"({signed(low)} to {signed(high)})"
+    )
+    ratio = versus["effort_ratio"]
+    if ratio is None:
+        yield text
+        return
+    effort = f"effort × {number(ratio)}"
+    if versus["effort_ratio_ci95"] is not None:
+        low, high = versus["effort_ratio_ci95"]
+        effort += f" ({number(low)} to {number(high)})"
+    whole = f"{text}, {effort}"
+    if len(whole) <= _WIDTH:
+        yield whole
+    else:
+        yield f"{text},"
+        yield f"    {effort}"
+
+
+def sweeps(rows: Sequence[Row]) -> Iterator[tuple[str, list[str], list[list[str]]]]:
+    """Yield title, headings and lines of a table per measure, conditions side by side.
+
+    There is a table of success, one of effort and one of time for each kind of disturbance and
+    number of agents against the bounds; where there are several numbers of agents, for each
+    disturbance against these. Conditions that stand alone have none.
+    """
+    scale = _is_scale(rows)
+    for series in _series(rows):
+        points = list(dict.fromkeys(_point(row, scale) for row in series))
+        for begin in range(0, len(points), _MOST_COLUMNS):
+            part = points[begin : begin + _MOST_COLUMNS]
+            shown = [row for row in series if _point(row, scale) in part]
+            for name, _, content in (_SUCCESS, _EFFORT, _DELAY, *((_BATCH,) if scale else ())):
+                yield _sweep(name, content, shown, part, scale)
+
+
+def _is_scale(rows: Sequence[Row]) -> bool:
+    """Return whether numbers of agents are compared, and not bounds."""
+    return len({row["agents"] for row in rows}) > 1
+
+
+def _series(rows: Sequence[Row]) -> list[list[Row]]:
+    """Group the rows that share a table of a sweep, without those of a condition alone."""
+    scale = _is_scale(rows)
+
+    def key(row: Row) -> tuple[str, float | int]:
+        return (row["disturbance"], row["bound"] if scale else row["agents"])
+
+    groups = [[row for row in rows if key(row) == one] for one in dict.fromkeys(map(key, rows))]
+    return [group for group in groups if len({_point(row, scale) for row in group}) > 1]
+
+
+def _point(row: Row, scale: bool) -> float:
+    return float(row["agents"] if scale else row["bound"])
+
+
+def _sweep(
+    name: str,
+    content: Callable[[Row], str],
+    rows: Sequence[Row],
+    points: Sequence[float],
+    scale: bool,
+) -> tuple[str, list[str], list[list[str]]]:
+    first = rows[0]
+    about = f"{first['task']}, {first['preset']}, {first['disturbance']} disturbance, "
+    about += f"d̄ = {first['bound']:g}" if scale else agents_title(first)
+    headings = ["agents" if scale else "d̄", *(f"{point:g}" for point in points)]
+    lines: dict[tuple[str, bool], dict[float, str]] = {}
+    labels: dict[tuple[str, bool], str] = {}
+    for row in ordered(rows):
+        key = (row["policy"], row["safety_filter"])
+        labels[key] = _label(row)
+        lines.setdefault(key, {})[_point(row, scale)] = content(row)
+    contents = [
+        [labels[key], *(cells.get(point, "–") for point in points)] for key, cells in lines.items()
+    ]
+    return f"{name}\n{about}, {first['episodes']} worlds", headings, contents
+
+
+def _success(row: Row) -> str:
+    # The wider side of the interval: near 100 % the other one is narrower.
+    low, high = row["success_world_ci95"]
+    rate = row["success_rate"]
+    return f"{percent(rate)} ±{100 * max(high - rate, rate - low):.1f}{mark(row)}"
+
+
+_SUCCESS: Column = ("Success [%], ± the wider side of its 95 % interval over worlds", "", _success)
+_EFFORT: Column = ("Effort [N²s]", "", _effort)
+_DELAY: Column = (
+    "Δt [ms], median: one agent's decision, or one plan for all agents",
+    "",
+    lambda row: milliseconds(plan_or_step(row, "median")),
+)
+_BATCH: Column = (
+    "Δt per agent [ms], median, where one call decides for all agents of a world",
+    "",
+    lambda row: milliseconds(row["step_time_batch_per_agent_s"]),
+)
+
+
+def markdown_grids(groups: Sequence[Sequence[Row]]) -> list[str]:
+    """Return the tables of the sweeps as Markdown, then those of conditions that stand alone."""
+    rows = [row for group in groups for row in group]
+    blocks = []
+    for name, headings, contents in sweeps(rows):
+        blocks += [name.replace("\n", ": "), markdown_table(headings, _trimmed(contents))]
+    swept = [row for series in _series(rows) for row in series]
+    for group in (group for group in groups if group[0] not in swept):
+        headings = [f"{heading} [{unit}]" if unit else heading for heading, unit, _ in COLUMNS]
+        lines = [[content(row) for _, _, content in COLUMNS] for row in ordered(group)]
+        blocks += [condition_title(group[0]), markdown_table(headings, _trimmed(lines))]
+    return blocks
+
+
+def _trimmed(contents: Sequence[Sequence[str]]) -> list[list[str]]:
+    return [[cell.strip() for cell in line] for line in contents]

@@ -1,0 +1,1 @@
+"""Spacecraft simulators in the plane, among discs and each other."""

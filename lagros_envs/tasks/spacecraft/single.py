@@ -1,0 +1,161 @@
+"""`lagros/Spacecraft-v0`: one spacecraft among obstacles, as a Gymnasium environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from lagros_envs.conventions import RENDER_MODES, Conforming, check_render_mode, plain_seed
+from lagros_envs.options import checked_actions, real_numbers
+from lagros_envs.tasks.spacecraft import task
+from lagros_envs.tasks.spacecraft.episode import (
+    SpacecraftDrawing,
+    SpacecraftEpisode,
+    action_space,
+    one_info,
+)
+from lagros_envs.tasks.spacecraft.scenarios import Preset, Scenario
+from lagros_envs.tasks.spacecraft.sensing import observe
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+
+
+class SpacecraftEnv(SpacecraftDrawing, Conforming, gym.Env[Float32Array, Float32Array]):
+    """One spacecraft that seeks its goal among obstacles, under bounded disturbance.
+
+    The world, action, observation, reward and info of `spacecraft.SpacecraftParallelEnv` with a
+    single agent: the one slot for a neighbour is always empty. `terminated` at a collision,
+    `truncated` at 45 s; the episode goes on after the arrival. `max_episode_steps` of `gym.make` is
+    as in `CartPoleEnv`.
+
+    `reset(options=...)` takes `scenario`, a `tasks.spacecraft.scenarios.Scenario` of one agent,
+    and `nominal`, x_d at every control instant, shape (steps + 1, 6).
+
+    Args:
+        preset: As in `SpacecraftParallelEnv`.
+        disturbance: As in `SpacecraftParallelEnv`.
+        disturbance_bound: As in `SpacecraftParallelEnv`.
+        disturbance_channels: As in `SpacecraftParallelEnv`.
+        metric: As in `SpacecraftParallelEnv`.
+        settings: As in `SpacecraftParallelEnv`.
+        render_mode: None, "human" or "rgb_array".
+
+    Raises:
+        ValueError: A setting is not valid.
+    """
+
+    settings: task.SpacecraftSettings
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}
+
+    def __init__(
+        self,
+        preset: str | Preset | Mapping[str, Any] = "paper",
+        disturbance: str | Any = "none",
+        disturbance_bound: float = 0.4,
+        disturbance_channels: Literal["all", "rates"] | Sequence[bool] = "all",
+        metric: Any = None,
+        settings: task.SpacecraftSettings | Mapping[str, Any] | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """Build the environment; see the class for the arguments."""
+        self.render_mode = check_render_mode(render_mode)
+        self.episode = SpacecraftEpisode(
+            1, preset, disturbance, disturbance_bound, disturbance_channels, metric, settings
+        )
+        self.settings, self.preset = self.episode.settings, self.episode.preset
+        self.disturbance = self.episode.disturbance
+        self.named_space = self.episode.layout.named_space
+        self.observation_space = cast(
+            "spaces.Space[Float32Array]", spaces.flatten_space(self.named_space)
+        )
+        self.action_space = cast("spaces.Space[Float32Array]", action_space())
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float32Array, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seed of the episode; the scenario and the disturbance have a stream each.
+            options: `scenario` and `nominal`, see the class.
+
+        Returns:
+            The observation and the info.
+
+        Raises:
+            ValueError: The seed is none, or an option is unknown or has a wrong type, shape or
+                value.
+        """
+        given = self.episode.checked(_with_agents(options))
+        seed = plain_seed(seed)
+        super().reset(seed=seed)
+        self.episode.start(int(self.np_random.integers(2**63)) if seed is None else seed, given)
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), self._info()
+
+    def step(self, action: Float32Array) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
+        """Hold the thrust for one control step.
+
+        Args:
+            action: Thrust in units of `settings.thrust_scale`, shape (8,).
+
+        Returns:
+            Observation, reward, terminated, truncated, info.
+
+        Raises:
+            ValueError: The action is not eight finite numbers.
+            RuntimeError: The environment was not reset.
+        """
+        self.episode.need_start("step()")
+        values = checked_actions(action, (task.THRUSTERS,), task.ACTION)
+        outcome = self.episode.step(task.applied_forces(self.settings, values)[None])
+        if self.render_mode == "human":
+            self.render()
+        return (
+            self._observation(),
+            float(outcome.reward[0, 0]),
+            bool(outcome.terminated[0, 0]),
+            bool(outcome.truncated[0, 0]),
+            self._info(),
+        )
+
+    @property
+    def state(self) -> FloatArray:
+        """The state x in double precision, shape (6,)."""
+        self.episode.need_start("state")
+        return cast(FloatArray, self.episode.world.states[0, 0])
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of the episode."""
+        self.episode.need_start("scenario")
+        return cast(Scenario, self.episode.world.scenarios[0])
+
+    @property
+    def time(self) -> float:
+        """The time t [s]."""
+        self.episode.need_start("time")
+        return float(self.episode.world.time[0])
+
+    def _observation(self) -> Float32Array:
+        return cast(Float32Array, observe(self.episode.world, self.episode.layout)[0, 0])
+
+    def _info(self) -> dict[str, Any]:
+        return one_info(self.episode.world.info(), 0)
+
+
+def _with_agents(options: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """Give a nominal (steps + 1, 6) the axis of the one agent."""
+    if not isinstance(options, Mapping):
+        return options
+    nominal = real_numbers(options.get("nominal"))
+    if nominal is None or nominal.ndim != 2:
+        return options
+    return {**options, "nominal": nominal[:, None]}

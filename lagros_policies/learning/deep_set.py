@@ -1,0 +1,197 @@
+"""Deep sets over neighbours and obstacles that run without torch, stored as safetensors.
+
+    y = rho(own, sum_k w_k phi_n(neighbour_k), sum_k w_k phi_o(obstacle_k))
+
+with ReLU between the layers. A sum does not depend on the order of its terms, nor their number on
+the weights: the same network serves any number of agents and obstacles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.checks import shown
+from lagros_policies.learning.networks import read_safetensors, write_safetensors
+from lagros_policies.tasks.spacecraft.features import (
+    NEIGHBOUR,
+    OBSTACLE,
+    OWN,
+    SpacecraftFeatures,
+)
+
+Float32Array = NDArray[np.float32]
+Layers = Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
+
+OUTPUTS = 3  # acceleration in the frame of the goal, and of the heading
+_FORMAT = "lagros-deep-set-1"
+# Up to this many entries a matrix of weights adds up faster than a walk over the owners.
+_DENSE = 4096
+_PARTS = ("neighbour", "obstacle", "agent")
+
+
+class DeepSet:
+    """A deep set, evaluated in NumPy float32 for all agents of all worlds in one call.
+
+    Normalisation of inputs and outputs is folded into the first and last layers.
+
+    Args:
+        neighbour: phi_n, layers of weights (inputs, outputs) and biases (outputs,), ReLU after
+            each.
+        obstacle: phi_o, likewise.
+        agent: rho, likewise, without ReLU after the last.
+        metadata: Strings that describe the network; stored beside the weights.
+
+    Raises:
+        ValueError: The shapes do not chain, or a number is not finite.
+    """
+
+    def __init__(
+        self,
+        neighbour: Layers,
+        obstacle: Layers,
+        agent: Layers,
+        metadata: dict[str, str] | None = None,
+    ) -> None:
+        """Copy the layers to float32."""
+        self.metadata = dict(metadata or {})
+        parts = {"neighbour": neighbour, "obstacle": obstacle, "agent": agent}
+        self.layers = {
+            name: [(_float32(weight), _float32(bias)) for weight, bias in layers]
+            for name, layers in parts.items()
+        }
+        first = _check("neighbour", self.layers["neighbour"], len(NEIGHBOUR))
+        second = _check("obstacle", self.layers["obstacle"], len(OBSTACLE))
+        last = _check("agent", self.layers["agent"], len(OWN) + first + second)
+        if last != OUTPUTS:
+            raise ValueError(f"the network has {last} outputs; it must have {OUTPUTS}")
+        self._widths = (first, second)
+
+    def __call__(self, features: SpacecraftFeatures) -> Float32Array:
+        """Evaluate the network for B agents.
+
+        Args:
+            features: Of the agents.
+
+        Returns:
+            Accelerations towards the goal, across, and of the heading, shape (B, 3).
+        """
+        count, own = len(features.own), len(OWN)
+        first, second = self._widths
+        inputs = np.zeros((count, own + first + second), np.float32)
+        inputs[:, :own] = features.own
+        end = own
+        for name, width, elements in zip(
+            _PARTS, self._widths, (features.neighbours, features.obstacles), strict=False
+        ):
+            begin, end = end, end + width
+            if len(elements.owner):
+                values = _through(self.layers[name], elements.values)
+                pool(values, elements.owner, elements.weight, inputs[:, begin:end])
+        *hidden, (weight, bias) = self.layers["agent"]
+        outputs: Float32Array = np.dot(_through(hidden, inputs), weight)
+        outputs += bias
+        return outputs
+
+    @property
+    def weights(self) -> int:
+        """How many numbers were learned."""
+        return sum(
+            weight.size + bias.size for layers in self.layers.values() for weight, bias in layers
+        )
+
+    def save(self, path: Path | str) -> None:
+        """Write weights and metadata as safetensors, atomically."""
+        tensors = {
+            f"{part}{index}.{name}": tensor
+            for part, layers in self.layers.items()
+            for index, layer in enumerate(layers)
+            for name, tensor in zip(("weight", "bias"), layer, strict=True)
+        }
+        write_safetensors(path, tensors, {**self.metadata, "format": _FORMAT})
+
+    @classmethod
+    def load(cls, path: Path | str) -> DeepSet:
+        """Read a network.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file is damaged or not such a network.
+        """
+        tensors, metadata = read_safetensors(path)
+        if metadata.get("format") != _FORMAT:
+            raise ValueError(
+                f"{path} is not a deep set of this package: its metadata say {shown(metadata)}"
+            )
+        counts = [sum(name.startswith(part) for name in tensors) // 2 for part in _PARTS]
+        names = [
+            [(f"{part}{index}.weight", f"{part}{index}.bias") for index in range(count)]
+            for part, count in zip(_PARTS, counts, strict=True)
+        ]
+        if sorted(tensors) != sorted(name for part in names for layer in part for name in layer):
+            raise ValueError(
+                f"{path} holds the tensors {shown(sorted(tensors))}, which are no layers"
+            )
+        layers = [[(tensors[weight], tensors[bias]) for weight, bias in part] for part in names]
+        try:
+            return cls(layers[0], layers[1], layers[2], metadata)
+        except ValueError as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def _through(layers: list[tuple[Float32Array, Float32Array]], values: Float32Array) -> Float32Array:
+    """Return the values after some layers, each followed by a ReLU."""
+    for weight, bias in layers:
+        values = np.dot(values, weight)
+        values += bias
+        np.maximum(values, 0.0, out=values)
+    return values
+
+
+def pool(
+    values: Float32Array, owner: NDArray[np.intp], weight: Float32Array, sums: Float32Array
+) -> None:
+    """Write the weighted sum of each owner's rows into the rows of `sums`.
+
+    Args:
+        values: Shape (e, h).
+        owner: Whose each row is, ascending, shape (e,).
+        weight: Shape (e,).
+        sums: Zeros, shape (B, h).
+    """
+    if len(sums) == 1:
+        np.dot(weight, values, out=sums[0])
+        return
+    if len(sums) * len(values) <= _DENSE:
+        sums[:] = np.dot((owner == np.arange(len(sums))[:, None]) * weight, values)
+        return
+    values *= weight[:, None]
+    begins = np.flatnonzero(np.diff(owner, prepend=-1))
+    sums[owner[begins]] = np.add.reduceat(values, begins, axis=0)
+
+
+def _float32(values: NDArray[np.floating]) -> Float32Array:
+    return np.array(values, np.float32, order="C")
+
+
+def _check(name: str, layers: Layers, width: int) -> int:
+    """Return the width after the layers of one part.
+
+    Raises:
+        ValueError: The shapes do not chain, or a number is not finite.
+    """
+    if not layers:
+        raise ValueError(f"the part {name!r} has no layers")
+    for index, (weight, bias) in enumerate(layers):
+        if weight.ndim != 2 or weight.shape[0] != width or bias.shape != weight.shape[1:]:
+            raise ValueError(
+                f"layer {index} of {name} has weights {weight.shape} and biases {bias.shape}, "
+                f"which do not follow a width of {width}"
+            )
+        if not (np.all(np.isfinite(weight)) and np.all(np.isfinite(bias))):
+            raise ValueError(f"layer {index} of {name} holds numbers that are not finite")
+        width = weight.shape[1]
+    return width

@@ -1,0 +1,323 @@
+"""Expert demonstrations: whole episodes in the environment, as offline learners read them.
+
+The cart-pole's expert is the one behind policy (b): one plan, tracked with u*. A re-plan on the way
+would confirm the plan (`tube_mpc`), so it is made once, and however long it takes: the data depend
+on settings and seed, never on the load of the machine. The expert of the spacecraft is policy (d)
+with one agent.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol, cast
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.checks import (
+    check_disturbance_bound,
+    check_fields,
+    check_name,
+    check_seed,
+    check_whole,
+)
+from lagros_envs.disturbances import OPEN_LOOP
+from lagros_envs.seeding import episode_seeds
+from lagros_envs.tasks.spacecraft.sensing import global_state
+from lagros_policies.policy import PolicyState
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+Environment = gym.Env[Any, Any]
+
+# Identifier of the environment of each task, and the bound of its disturbance if none is given.
+ENVIRONMENTS = {"cartpole": "lagros/CartPole-v0", "spacecraft": "lagros/Spacecraft-v0"}
+MOST_EPISODES = 1_000_000  # all lie in memory
+DEFAULT_BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
+
+
+@dataclass(frozen=True, slots=True)
+class DemonstrationSettings:
+    """What to fly.
+
+    Attributes:
+        task: "cartpole" or "spacecraft".
+        episodes: Number of episodes.
+        seed: Seed of the run. Its episodes belong to the namespace of training, so they are never
+            those of an evaluation, of whatever seed.
+        disturbance: An open-loop kind of `lagros_envs.disturbances`.
+        bound: d_bar, in units of the state per second; None for the task's own (0.75, 0.4).
+
+    Raises:
+        ValueError: A value is not valid.
+    """
+
+    task: str = "cartpole"
+    episodes: int = 100
+    seed: int = 0
+    disturbance: str = "uniform"
+    bound: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_fields(self)
+        check_name("task", self.task, ENVIRONMENTS)
+        check_whole("episodes", self.episodes, 1, MOST_EPISODES)
+        check_seed(self.seed)
+        if self.disturbance not in OPEN_LOOP:
+            raise ValueError(
+                f"disturbance={self.disturbance!r} must be one of {', '.join(OPEN_LOOP)}: whoever "
+                "reads the data must be able to repeat it without the expert's plan"
+            )
+        if self.bound is not None:
+            check_disturbance_bound("bound", self.bound, "or None for the task's own")
+
+    @property
+    def disturbance_bound(self) -> float:
+        """The bound d_bar in force; 0 without disturbance."""
+        if self.disturbance == "none":
+            return 0.0
+        return DEFAULT_BOUNDS[self.task] if self.bound is None else self.bound
+
+    def seeds(self) -> list[int]:
+        """Return the seeds of the episodes, as given to `env.reset(seed=...)`."""
+        return episode_seeds(self.seed, self.episodes)
+
+    def make_env(self) -> Environment:
+        """Return the environment in which the expert flies."""
+        return gym.make(
+            ENVIRONMENTS[self.task],
+            disturbance=self.disturbance,
+            disturbance_bound=self.disturbance_bound,
+        )
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One episode of N steps.
+
+    Attributes:
+        seed: Seed of the episode.
+        observations: What the environment showed, shape (N + 1, o).
+        actions: What the expert did, in the units of the environment, shape (N, m).
+        rewards: Reward of each step, shape (N,).
+        terminations: Whether the step ended the episode early, shape (N,).
+        truncations: Whether the step reached the time limit, shape (N,).
+        infos: The environment's `info` at every instant, and the plan: `nominal_state` x_d and
+            `nominal_control` u_d (force [N], or acceleration [m/s^2, m/s^2, rad/s^2]), nan where
+            there is none. Each of shape (N + 1,) or (N + 1, k).
+        counters: Plans that the expert asked for, and how many of them failed.
+    """
+
+    seed: int
+    observations: Float32Array
+    actions: Float32Array
+    rewards: FloatArray
+    terminations: BoolArray
+    truncations: BoolArray
+    infos: dict[str, NDArray[Any]]
+    counters: dict[str, int]
+
+    @property
+    def success(self) -> bool:
+        """Whether the environment calls the episode a success (the task's own definition)."""
+        return bool(self.infos["success"][-1])
+
+
+class Expert(Protocol):
+    """What a task's expert does in one episode."""
+
+    def act(
+        self, env: Environment, observation: Float32Array, state: PolicyState
+    ) -> tuple[Float32Array, PolicyState]:
+        """Return the action and what to remember; the state is None at the start."""
+
+    def nominal(self, state: PolicyState) -> tuple[FloatArray, FloatArray]:
+        """Return x_d (T + 1, n) and u_d (T + 1, k) up to the time limit, nan where unplanned."""
+
+    def counters(self, state: PolicyState) -> dict[str, int]:
+        """Return how many plans were made and failed."""
+
+    def record(self) -> dict[str, Any]:
+        """Return metric, planner and feedback, in plain values."""
+
+
+def make_expert(settings: DemonstrationSettings, env: Environment) -> Expert:
+    """Return the expert of a task, for the environment in which it flies."""
+    return _EXPERTS[settings.task](env.unwrapped)
+
+
+def fly(env: Environment, expert: Expert, seed: int) -> Demonstration:
+    """Fly one episode to its end, whatever the end is.
+
+    Args:
+        env: The environment, see `DemonstrationSettings.make_env`.
+        expert: The expert.
+        seed: Seed of the episode.
+
+    Returns:
+        What happened.
+    """
+    observation, info = env.reset(seed=seed)
+    observations, infos = [observation], [info]
+    actions: list[Float32Array] = []
+    steps: list[tuple[float, bool, bool]] = []
+    state: PolicyState = None
+    terminated = truncated = False
+    while not (terminated or truncated):
+        action, state = expert.act(env, observation, state)
+        observation, reward, terminated, truncated, info = env.step(action)
+        observations.append(observation)
+        infos.append(info)
+        actions.append(action)
+        steps.append((float(reward), terminated, truncated))
+    kept = {name: np.array([info[name] for info in infos]) for name in infos[0]}
+    states, controls = expert.nominal(state)
+    kept["nominal_state"] = states[: len(infos)]
+    kept["nominal_control"] = controls[: len(infos)]
+    rewards, terminations, truncations = zip(*steps, strict=True)
+    return Demonstration(
+        seed=seed,
+        observations=np.array(observations, np.float32),
+        actions=np.array(actions, np.float32),
+        rewards=np.array(rewards, np.float64),
+        terminations=np.array(terminations, np.bool_),
+        truncations=np.array(truncations, np.bool_),
+        infos=kept,
+        counters=expert.counters(state),
+    )
+
+
+def demonstrate(
+    settings: DemonstrationSettings, on_episode: Callable[[int], None] | None = None
+) -> tuple[list[Demonstration], dict[str, Any]]:
+    """Fly all episodes of a run.
+
+    Args:
+        settings: What to fly.
+        on_episode: Called with the number of episodes that are finished.
+
+    Returns:
+        The episodes in the order of their seeds, none left out, and the record of what they depend
+        on: the settings, the metric and the planner.
+    """
+    env = settings.make_env()
+    try:
+        expert = make_expert(settings, env)
+        flown: list[Demonstration] = []
+        for seed in settings.seeds():
+            flown.append(fly(env, expert, seed))
+            if on_episode is not None:
+                on_episode(len(flown))
+        task_settings = cast(Any, env.unwrapped).settings
+    finally:
+        env.close()
+    record = {
+        "run": asdict(settings) | {"bound": settings.disturbance_bound},
+        "task_settings": asdict(task_settings),
+        **expert.record(),
+    }
+    return flown, record
+
+
+class _CartPoleExpert:
+    """One plan of the whole episode, tracked with u*."""
+
+    def __init__(self, env: Any) -> None:
+        from lagros_policies.contraction import load_metric
+        from lagros_policies.tube_mpc import TubeMpcPolicy
+
+        self._task = env.settings
+        self._metric = load_metric()
+        # A failed plan is asked for again at the next step, as policy (b) does.
+        self._policy = TubeMpcPolicy(
+            env.settings, self._metric, replan_every=self._task.steps, deadline=math.inf
+        )
+
+    def act(
+        self, env: Environment, observation: Float32Array, state: PolicyState
+    ) -> tuple[Float32Array, PolicyState]:
+        return self._policy.predict(observation, state)
+
+    def nominal(self, state: PolicyState) -> tuple[FloatArray, FloatArray]:
+        plan, steps = state[0].plan, self._task.steps
+        states, controls = np.full((steps + 1, 4), np.nan), np.full((steps + 1, 1), np.nan)
+        if plan is not None:
+            states[steps - plan.horizon :] = plan.states
+            controls[steps - plan.horizon : steps] = plan.controls
+        return states, controls
+
+    def counters(self, state: PolicyState) -> dict[str, int]:
+        counted = self._policy.counters(state)
+        return {name: counted[name] for name in ("plans", "failed_plans")}
+
+    def record(self) -> dict[str, Any]:
+        from lagros_policies.contraction.metric_files import region_record
+
+        expert, metric = self._policy.expert, self._metric
+        check = metric.verification
+        return {
+            "metric": {
+                # The digest that the manifests of training data carry.
+                "sha256": hashlib.sha256(metric.coefficients.tobytes()).hexdigest(),
+                "alpha": metric.contraction_rate,
+                "chi": metric.condition_bound,
+                "nu": metric.control_weight,
+                "region": region_record(metric.region),
+                "verification": None if check is None else asdict(check),
+            },
+            "planner": asdict(expert.planner.settings),
+            "feedback": asdict(expert.feedback),
+        }
+
+
+class _SpacecraftExpert:
+    """One plan of the whole episode among the obstacles, tracked with u*."""
+
+    def __init__(self, env: Any) -> None:
+        from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
+
+        self._task = env.settings
+        self._policy = CentralizedPolicy(
+            env.settings, env.preset, 1, disturbance_bound=env.disturbance.bound
+        )
+
+    def act(
+        self, env: Environment, observation: Float32Array, state: PolicyState
+    ) -> tuple[Float32Array, PolicyState]:
+        # The planner knows all obstacles, also those that are not in sight yet.
+        world = cast(Any, env.unwrapped).episode.world
+        actions, state = self._policy.predict(global_state(world)[0], state)
+        return actions[0], state
+
+    def nominal(self, state: PolicyState) -> tuple[FloatArray, FloatArray]:
+        memory = state[0]
+        states, controls = memory.nominal[:, 0].copy(), memory.accelerations[:, 0]
+        controls = np.concatenate([controls, np.full((1, 3), np.nan)])
+        if not memory.solved:
+            states[:], controls[:] = np.nan, np.nan
+        return states, controls
+
+    def counters(self, state: PolicyState) -> dict[str, int]:
+        return self._policy.counters(state)
+
+    def record(self) -> dict[str, Any]:
+        tracking = self._policy.tracking
+        return {
+            "metric": {
+                name: {"alpha": axis.rate, "chi": axis.state_condition, "dual": axis.dual.tolist()}
+                for name, axis in (("plane", tracking.plane), ("turning", tracking.turning))
+            },
+            "planner": asdict(self._policy.planner.settings),
+        }
+
+
+_EXPERTS: dict[str, Callable[[Any], Expert]] = {
+    "cartpole": _CartPoleExpert,
+    "spacecraft": _SpacecraftExpert,
+}

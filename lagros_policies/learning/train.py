@@ -1,0 +1,169 @@
+"""Fit a network to expert data; interrupted, it goes on from its last checkpoint."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.checks import check_each, check_fields, check_positive, check_seed, check_whole
+from lagros_policies.learning.fitting import Fit, IntArray, one_thread
+from lagros_policies.learning.networks import Mlp
+
+if TYPE_CHECKING:
+    import torch
+
+Float32Array = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How to fit.
+
+    Attributes:
+        hidden: Width of each hidden layer; the paper's network is 3 layers of 100.
+        epochs: Passes over the data.
+        batch: Samples per step.
+        learning_rate: Adam's step at first; a cosine takes it to a hundredth of that.
+        held_out: Share of the plans whose samples are never trained on.
+        checkpoint_every: Epochs between checkpoints.
+        seed: Seed of initial weights and sample order.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    hidden: tuple[int, ...] = (100, 100, 100)
+    epochs: int = 600
+    batch: int = 512
+    learning_rate: float = 3e-3
+    held_out: float = 0.1
+    checkpoint_every: int = 25
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_fields(self)
+        check_each("hidden", self.hidden, 1)
+        for name in ("epochs", "batch", "checkpoint_every"):
+            check_whole(name, getattr(self, name))
+        check_seed(self.seed)
+        check_positive("learning_rate", self.learning_rate)
+        if not 0.0 < self.held_out < 1.0:
+            raise ValueError(f"held_out={self.held_out!r} must be in (0, 1)")
+
+
+@dataclass(frozen=True)
+class LearningError:
+    """The learning error eps_l on held-out samples, in units of the control (observed).
+
+    Attributes:
+        mean: Mean of ||u_L - u*||.
+        p99: 99th percentile.
+        maximum: Largest.
+        samples: Number of held-out samples.
+    """
+
+    mean: float
+    p99: float
+    maximum: float
+    samples: int
+
+
+def learning_error(network: Mlp, features: Float32Array, labels: Float32Array) -> LearningError:
+    """Measure ||u_L - u*|| over samples, features (s, inputs) and labels (s, outputs)."""
+    distance = np.linalg.norm(network(features) - labels, axis=-1)
+    return LearningError(
+        float(distance.mean()),
+        float(np.quantile(distance, 0.99)),
+        float(distance.max()),
+        len(distance),
+    )
+
+
+def fit(
+    features: Float32Array,
+    labels: Float32Array,
+    settings: TrainingSettings,
+    checkpoint: Path,
+    on_epoch: Callable[[int, float], None] | None = None,
+) -> Mlp:
+    """Fit a network by Adam on the mean of ||u_L - u*||, the loss of the paper.
+
+    Args:
+        features: Inputs, shape (s, inputs).
+        labels: Expert controls, shape (s, outputs).
+        settings: How to fit.
+        checkpoint: File that holds the progress; removed by nobody, resumed from if it fits.
+        on_epoch: Called with the epochs done and the last epoch's loss.
+
+    Returns:
+        The network, with the normalisation folded in.
+    """
+    with one_thread():
+        run = _Run(features, labels, settings, checkpoint)
+        run.finish(on_epoch)
+        return run.network()
+
+
+class _Run(Fit[TrainingSettings]):
+    """A run over features and labels, each scaled to mean zero and deviation one."""
+
+    def __init__(
+        self,
+        features: Float32Array,
+        labels: Float32Array,
+        settings: TrainingSettings,
+        checkpoint: Path,
+    ) -> None:
+        import torch
+
+        self.input_mean, self.input_scale = _statistics(features)
+        self.output_mean, self.output_scale = _statistics(labels)
+        self.features = torch.from_numpy((features - self.input_mean) / self.input_scale)
+        self.labels = torch.from_numpy((labels - self.output_mean) / self.output_scale)
+        torch.manual_seed(settings.seed)
+        widths = [features.shape[1], *settings.hidden, labels.shape[1]]
+        layers: list[torch.nn.Module] = []
+        for width, following in itertools.pairwise(widths):
+            layers += [torch.nn.Linear(width, following), torch.nn.Tanh()]
+        self.model = torch.nn.Sequential(*layers[:-1])
+        data = hashlib.sha256(features.tobytes() + labels.tobytes()).hexdigest()
+        super().__init__(settings, checkpoint, list(self.model.parameters()), len(features), data)
+
+    def batches(self, order: IntArray) -> list[IntArray]:
+        """Cut off full batches; the last one holds the rest."""
+        size = self.settings.batch
+        return [order[first : first + size] for first in range(0, len(order), size)]
+
+    def loss(self, batch: IntArray) -> torch.Tensor:
+        """Return the mean of ||u_L - u*|| over a batch."""
+        import torch
+
+        rows = torch.from_numpy(batch)
+        error = self.model(self.features[rows]) - self.labels[rows]
+        # The paper's loss is the norm of the error; smoothed at zero so that it has a gradient.
+        return torch.sqrt((error * error).sum(1) + 1e-6).mean()
+
+    def network(self) -> Mlp:
+        """Return the network with the normalisation folded into its first and last layer."""
+        state = [tensor.detach().numpy().astype(np.float64) for tensor in self.model.parameters()]
+        weights, biases = [w.T for w in state[0::2]], state[1::2]
+        weights[0] = weights[0] / self.input_scale[:, None]
+        biases[0] = biases[0] - self.input_mean @ weights[0]
+        weights[-1] = weights[-1] * self.output_scale
+        biases[-1] = biases[-1] * self.output_scale + self.output_mean
+        return Mlp(weights, biases)
+
+
+def _statistics(values: Float32Array) -> tuple[Float32Array, Float32Array]:
+    deviation = values.std(axis=0, dtype=np.float64).astype(np.float32)
+    mean = values.mean(axis=0, dtype=np.float64).astype(np.float32)
+    return mean, np.where(deviation > 0.0, deviation, np.float32(1.0))

@@ -1,0 +1,1 @@
+"""Plans of one agent among what it senses."""

@@ -1,0 +1,1 @@
+"""The remarks of the paper: neural, adaptive, Lagrangian and stochastic contraction."""

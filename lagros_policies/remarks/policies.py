@@ -1,0 +1,215 @@
+"""The remarks of the paper as policies that fly beside the others (`docs/extensions.md`).
+
+None of them is in the tables of results, so that they are named by module and class:
+
+    make("lagros_policies.remarks.policies:AdaptiveTubeMpcPolicy", env)
+    lagros bench cartpole --policies tube-mpc,lagros_policies.remarks.policies:NeuralTubeMpcPolicy
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.checks import check_positive
+from lagros_envs.conventions import settings_of
+from lagros_envs.dynamics import System
+from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.spacecraft.scenarios import Preset
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_policies.contraction.metric import ContractionMetric
+from lagros_policies.observed import cartpole_rows
+from lagros_policies.policy import PolicyState, row_memories
+from lagros_policies.remarks.adaptive import (
+    AdaptiveControl,
+    cart_mass_regressor,
+    friction_regressor,
+    largest_gain,
+)
+from lagros_policies.remarks.lagrangian import SlidingAxis, SlidingTracking
+from lagros_policies.remarks.neural.metric import load_neural_metric
+from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
+from lagros_policies.tube_mpc import TubeMpcPolicy, TubeMpcState, check_shipped_metric
+
+Float32Array = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+
+# What the adaptation is prepared for: |dp/dt| [m/s] and |d2p/dt2| [m/s^2] of the cart, and how far
+# its friction [N s/m] and its mass [kg] may be from the model's.
+_REACH = (1.5, 8.0)
+_LIMITS = (3.0, 0.8)
+_LEAKAGE = 0.02  # [1/s]
+
+
+class NeuralTubeMpcPolicy(TubeMpcPolicy):
+    """Online tube MPC whose u* contracts in a metric that is a network.
+
+    Args:
+        settings: The task.
+        metric: File of `save_neural_metric`; the shipped network if left out.
+        replan_every: Control steps between plans.
+        deadline: Delta t_max, after which a plan is late [s].
+        clock: Source of the time, for tests [s].
+        allow_other_settings: As in `TubeMpcPolicy`.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is not such a metric, or a number is out of range.
+    """
+
+    name = "neural-tube-mpc"
+
+    def __init__(
+        self,
+        settings: task.CartPoleSettings | None = None,
+        metric: str | Path | None = None,
+        replan_every: int = 1,
+        deadline: float = 0.1,
+        clock: Callable[[], float] = perf_counter,
+        allow_other_settings: bool = False,
+    ) -> None:
+        """Read the network and build planner and law."""
+        if metric is None:
+            check_shipped_metric(
+                settings_of(task.CartPoleSettings(), settings), allow_other_settings
+            )
+        super().__init__(settings, load_neural_metric(metric), replan_every, deadline, clock)
+
+
+@dataclass
+class AdaptiveState(TubeMpcState):
+    """What the adaptive policy remembers of one episode, beside its plans.
+
+    Attributes:
+        estimate: a_hat: friction [N s/m] and mass [kg] of the cart, less the model's.
+        step: Control step of the last call; -1 before the first.
+        state: x at that step, shape (4,).
+        wanted: u* at that step, shape (1,) [N].
+    """
+
+    estimate: FloatArray = field(default_factory=lambda: np.zeros(2))
+    step: int = -1
+    state: FloatArray = field(default_factory=lambda: np.zeros(task.STATE_DIM))
+    wanted: FloatArray = field(default_factory=lambda: np.zeros(1))
+
+
+def _friction_and_mass(model: System, state: FloatArray, control: FloatArray) -> FloatArray:
+    """Return Y for both unknowns, shape (..., 1, 2)."""
+    parts = friction_regressor(state, control), cart_mass_regressor(model)(state, control)
+    return np.concatenate(parts, axis=-1)
+
+
+class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
+    """Online tube MPC that finds a wrong friction or mass of the cart while it flies (aNCM).
+
+    The force is u* - Y a_hat; from one call to the next a_hat moves as `AdaptiveControl.update`
+    says. The estimate belongs to an episode and starts at zero.
+
+    Args:
+        settings: The task, with the system that the policy *believes* in.
+        metric: The contraction metric, or its file; the shipped one if left out.
+        replan_every: Control steps between plans.
+        deadline: Delta t_max, after which a plan is late [s].
+        clock: Source of the time, for tests [s].
+        allow_other_settings: As in `TubeMpcPolicy`.
+
+    Raises:
+        ValueError: A number is out of range.
+    """
+
+    name = "adaptive-tube-mpc"
+
+    def __init__(
+        self,
+        settings: task.CartPoleSettings | None = None,
+        metric: ContractionMetric | str | Path | None = None,
+        replan_every: int = 1,
+        deadline: float = 0.1,
+        clock: Callable[[], float] = perf_counter,
+        allow_other_settings: bool = False,
+    ) -> None:
+        """Build planner, law and adaptation."""
+        super().__init__(settings, metric, replan_every, deadline, clock, allow_other_settings)
+        law = self.expert.law
+        # A function of the module, so that the policy can be pickled.
+        regressor = partial(_friction_and_mass, law.system)
+        gain = largest_gain(law, _REACH)
+        self.adaptive = AdaptiveControl(law, regressor, gain, _LEAKAGE, _LIMITS)
+
+    def predict(
+        self,
+        observation: Float32Array,
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, PolicyState]:
+        """Plan, learn and track; see `Policy.predict`. The state is one per row."""
+        count = len(np.atleast_2d(cartpole_rows(observation, np.float64)))
+        memories = row_memories(state, episode_start, count, "episodes", AdaptiveState)
+        fresh = [AdaptiveState() if memory is None else memory for memory in memories]
+        return super().predict(observation, fresh, None, deterministic)
+
+    def _force(self, row: FloatArray, memory: Any) -> FloatArray:
+        wanted = super()._force(row, memory)
+        if memory.tracked is None:
+            return wanted
+        state = row[task.STATE]
+        step = round(float(row[task.TIME]) / self.settings.control_period)
+        if 0 <= memory.step == step - 1 < self.settings.steps - 1:
+            nominal = memory.tracked.states[0, step - memory.tracked.first_step]
+            memory.estimate = self.adaptive.update(
+                memory.estimate, memory.state, memory.wanted, state, nominal
+            )
+        memory.step, memory.state, memory.wanted = step, state.copy(), wanted
+        return self.adaptive.corrected(state, wanted, memory.estimate)
+
+
+class SlidingCentralizedPolicy(CentralizedPolicy):
+    """The centralised planner with a known Lyapunov function in place of the metric's u*.
+
+    Args:
+        settings: The task.
+        preset: The preset, or its name.
+        num_agents: Number of agents; None for the preset's own.
+        disturbance_bound: d_bar to prepare for, in units of the state per second.
+        position_rate: lambda, at which the position error follows the sliding variable [1/s].
+        sliding_rate: k, at which the sliding variable contracts [1/s].
+        turning_rate: Both rates of the heading [1/s].
+        margin: Room beyond touching that plans ask for first [m]; None takes it from the bound, as
+            u* at 2 1/s would, whose error is that of this law at 3 1/s.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    name = "sliding-centralized"
+
+    def __init__(
+        self,
+        settings: SpacecraftSettings | None = None,
+        preset: str | Preset = "paper",
+        num_agents: int | None = None,
+        disturbance_bound: float = 0.4,
+        position_rate: float = 3.0,
+        sliding_rate: float = 3.0,
+        turning_rate: float = 0.3,
+        margin: float | None = None,
+    ) -> None:
+        """Build planner and law."""
+        super().__init__(settings, preset, num_agents, disturbance_bound, margin=margin)
+        period = self.settings.control_period
+        check_positive("turning_rate", turning_rate)
+        # It answers the calls of `WrenchTracking`, and a bound of its own comes with it.
+        law: Any = SlidingTracking(
+            self.settings.system,
+            SlidingAxis(position_rate, sliding_rate, period),
+            SlidingAxis(turning_rate, turning_rate, period),
+        )
+        self.tracking = law

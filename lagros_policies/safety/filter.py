@@ -1,0 +1,342 @@
+"""The safety filter: a wrapper that changes any policy's action least so that nothing is touched.
+
+The inner action makes a force in the plane and a torque. The torque is kept, and the force changed
+least, min ||a - a_0||^2, so that the acceleration a lies in one half-plane for each neighbour and
+obstacle that is sensed (`barrier`); `half_planes.nearest` answers exactly. An agent that is blocked
+is turned to pass what blocks it. Where nothing is to be changed the action is the policy's own, bit
+for bit. Nothing is silent: what the filter does is counted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.checks import check_instance
+from lagros_envs.tasks.spacecraft import task
+from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN, VELOCITY_X
+from lagros_envs.tasks.spacecraft.scenarios import Preset
+from lagros_envs.tasks.spacecraft.sensing import OBSTACLE_DIM, Layout
+from lagros_policies.observed import as_numbers
+from lagros_policies.policy import Policy, PolicyState
+from lagros_policies.safety.barrier import BarrierSettings, BrakingBarrier, HalfPlanes
+from lagros_policies.safety.half_planes import nearest
+from lagros_policies.tasks.spacecraft.sensed import Sensed, WorldState
+from lagros_policies.tasks.spacecraft.setup import PLANE, task_and_preset
+from lagros_policies.tasks.spacecraft.thrusters import allocate, to_body
+
+Float32Array = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+COUNTERS = ("filtered_steps", "interventions", "infeasible")
+# A violation below this is rounding [m/s^2].
+_ROUNDING = 1e-6
+# Where not all can be kept, this share of the violation falls to obstacles: a neighbour that comes
+# too close gives way, an obstacle does not.
+_OBSTACLE_SOFTNESS = 0.3
+# An agent is blocked if the goal lies within this cosine of behind what it must not touch ...
+_FACING = 0.7
+# ... and it passes clockwise, unless it already passes faster than this the other way [m/s].
+_ALREADY_PASSING = 0.05
+
+
+class FilterState(NamedTuple):
+    """What the filter remembers; the inner state comes first.
+
+    Attributes:
+        inner: The state of the inner policy.
+        counts: For each row of the observation the `COUNTERS` of its episode, shape (B, 3).
+    """
+
+    inner: PolicyState
+    counts: IntArray
+
+
+class SafetyFilter:
+    """A policy whose actions keep clear of what is sensed.
+
+    It uses what lies within the sensing radius and the radii of the preset, also for an inner
+    policy that observes everything. Every agent is taken to wear it: of two agents, each does half.
+
+    Args:
+        policy: The inner policy, of the spacecraft; its actions are those of the environment.
+        settings: The task. With a thrust limit the filter commands no thruster beyond it, and a
+            torque that leaves no room for the force gives way.
+        preset: The preset, or its name: the layout of the observation and the radii.
+        num_agents: Number of agents; None for the preset's own.
+        disturbance_bound: d_bar to prepare for, in units of the state per second.
+        barrier: Margins and rates; None takes those tuned for the bound.
+
+    Raises:
+        TypeError: The inner policy is not one.
+        ValueError: A value is out of range, or a rate is too fast for the control period.
+    """
+
+    observes: Literal["local", "global"]
+
+    def __init__(
+        self,
+        policy: Policy,
+        settings: task.SpacecraftSettings | None = None,
+        preset: str | Preset = "paper",
+        num_agents: int | None = None,
+        disturbance_bound: float = 0.4,
+        barrier: BarrierSettings | None = None,
+    ) -> None:
+        """Build the barrier."""
+        if not isinstance(policy, Policy):
+            raise TypeError(
+                f"the inner policy is a {type(policy).__name__}; it needs name, observes and "
+                "predict, as lagros_policies.make builds it"
+            )
+        if policy.observes not in ("local", "global"):
+            raise ValueError(f'observes={policy.observes!r} must be "local" or "global"')
+        self.policy = policy
+        self.name = f"{policy.name}+filter"
+        self.observes = policy.observes
+        self.settings, self.preset = task_and_preset(settings, preset, num_agents)
+        self.layout = Layout.for_preset(self.preset, self.settings)
+        chosen = BarrierSettings.for_bound(disturbance_bound) if barrier is None else barrier
+        check_instance("barrier", chosen, BarrierSettings)
+        limit = self.settings.thrust_limit
+        if limit is not None:
+            # Two thrusters push along an axis; half of that is kept for the rest.
+            most = limit / self.settings.system.mass
+            chosen = replace(chosen, braking=min(chosen.braking, most))
+        self._softness = np.repeat(
+            [1.0, _OBSTACLE_SOFTNESS, 0.0], [self.layout.neighbours, self.layout.obstacles, 4]
+        )
+        thrusters = np.eye(task.THRUSTERS)
+        self._wrench_of_thrust = np.stack(self.settings.system.wrench(list(thrusters)), axis=-1)
+        self.barrier = BrakingBarrier(
+            chosen,
+            self.preset.agent_radius,
+            self.preset.core,
+            self.settings.control_period,
+        )
+
+    def predict(
+        self,
+        observation: Float32Array,
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, PolicyState]:
+        """Ask the inner policy and filter its actions; see `Policy.predict`.
+
+        Args:
+            observation: As the inner policy takes it: rows of agents, (B, o) or (o,), or rows of
+                `state()`, (B, s) or (s,).
+            state: What the last call returned.
+            episode_start: Which rows start an episode, shape (B,).
+            deterministic: Passed on.
+
+        Returns:
+            The actions, of the shape of the inner policy's, and the state.
+
+        Raises:
+            ValueError: The observation, the state or the inner action has a wrong shape, or is not
+                finite.
+        """
+        rows = np.atleast_2d(as_numbers(observation, np.float64))
+        sensed = Sensed.of(self.layout, rows) if self.observes == "local" else self._sensed(rows)
+        inner, counts = self._remembered(state, len(rows), episode_start)
+        wanted, inner = self.policy.predict(observation, inner, episode_start, deterministic)
+        actions = self._checked(wanted, len(sensed.time))
+        filtered, changed, infeasible = self.filter(actions, sensed)
+        seen = np.stack([np.ones_like(changed), changed, infeasible], axis=-1)
+        counts = counts + seen.reshape(len(rows), -1, len(COUNTERS)).sum(axis=1)
+        return filtered.reshape(np.shape(wanted)), FilterState(inner, counts)
+
+    def counters(self, state: PolicyState) -> dict[str, int]:
+        """Return the inner policy's counters and the filter's own, over the rows of a state.
+
+        `filtered_steps` are the agent-steps seen, `interventions` those whose action was changed,
+        and `infeasible` those at which not everything could be kept clear of, so that the largest
+        violation was made least.
+        """
+        inner = getattr(self.policy, "counters", None)
+        totals = state.counts.sum(axis=0).tolist()
+        return {
+            **({} if inner is None else inner(state.inner)),
+            **dict(zip(COUNTERS, totals, strict=True)),
+        }
+
+    def reseed(self, generator: np.random.Generator) -> None:
+        """Pass the generator on, if the inner policy draws anything."""
+        inner = getattr(self.policy, "reseed", None)
+        if inner is not None:
+            inner(generator)
+
+    def filter(
+        self, actions: NDArray[Any], sensed: Sensed
+    ) -> tuple[Float32Array, BoolArray, BoolArray]:
+        """Change actions least.
+
+        Args:
+            actions: One per agent, shape (B, 8), in units of `settings.thrust_scale`.
+            sensed: What the agents sense.
+
+        Returns:
+            The actions in single precision, which of them were changed, and for which not all could
+            be kept clear of, (B,) each.
+        """
+        filtered = np.array(actions, np.float32)
+        infeasible = np.zeros(len(actions), bool)
+        body, h = self.settings.system, self.settings.control_period
+        wrench = task.applied_forces(self.settings, actions) @ self._wrench_of_thrust
+        # The force is held in the body's axes, which turn: take them in the middle of the hold.
+        turn = wrench[:, 2] / (2.0 * body.inertia)
+        middle = sensed.heading + 0.5 * h * sensed.spin + 0.125 * h * h * turn
+        wanted = to_body(wrench[:, :2] / body.mass, -middle)
+        planes = self.barrier.half_planes(sensed)
+        lack = planes.bounds - planes.x * wanted[:, :1] - planes.y * wanted[:, 1:]
+        changed: BoolArray = np.max(lack, axis=1) > 0.0
+        rows = np.flatnonzero(changed)
+        if rows.size == 0:
+            return filtered, changed, infeasible
+        wrench, middle, wanted = wrench[rows], middle[rows], wanted[rows]
+        target = wanted
+        if self.barrier.settings.sidestep_speed > 0.0:
+            target = wanted + self._sidestep(rows, np.argmax(lack[rows], axis=1), planes, sensed)
+        torque, most = self._authority(wrench)
+        axes = _body_axes(middle)
+        normals = np.stack([planes.x[rows], planes.y[rows]], axis=-1)
+        answer = nearest(
+            target,
+            np.concatenate([normals, axes, -axes], axis=1),
+            np.concatenate([planes.bounds[rows], -most, -most], axis=1),
+            self._softness,
+        )
+        force = to_body(body.mass * answer.points, middle)
+        thrust = allocate(body, np.concatenate([force, torque[:, None]], axis=1))
+        if self.settings.thrust_limit is not None:
+            thrust = np.minimum(thrust, self.settings.thrust_limit)
+        filtered[rows] = thrust / self.settings.thrust_scale
+        infeasible[rows] = answer.violation > _ROUNDING
+        return filtered, changed, infeasible
+
+    def _authority(self, wrench: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the torque to keep (B,) and the largest acceleration along each axis (B, 2)."""
+        body, limit = self.settings.system, self.settings.thrust_limit
+        force, torque = np.abs(wrench[:, :2]), wrench[:, 2]
+        most = np.maximum(body.mass * self.barrier.settings.largest_acceleration, force)
+        if limit is not None:
+            # `allocate` makes the torque with this share of it on the thrusters of each axis; at
+            # least half of every thruster is left to the force.
+            per_torque = np.array([body.arm, body.side_arm]) / (
+                2.0 * (body.arm**2 + body.side_arm**2)
+            )
+            largest = 0.5 * limit / per_torque.max()
+            torque = np.clip(torque, -largest, largest)
+            most = np.minimum(most, 2.0 * (limit - np.abs(torque)[:, None] * per_torque))
+        return torque, most / body.mass
+
+    def _sidestep(
+        self, rows: NDArray[np.intp], worst: NDArray[np.intp], planes: HalfPlanes, sensed: Sensed
+    ) -> FloatArray:
+        """Return what to add to the acceleration of agents that are blocked, (B, 2) [m/s^2].
+
+        Two agents that meet head-on, and an agent behind an obstacle, would wait for ever where the
+        filter leaves only the way back. An agent that does not get on, and whose goal lies behind
+        what it must not touch, is pushed along the rim until it passes at the sidestep's speed:
+        clockwise, or the way in which it already passes. Both agents of a pair find the same sense
+        of turning about each other.
+        """
+        kept = self.barrier.settings
+        x, y = planes.x[rows, worst], planes.y[rows, worst]
+        goal = sensed.goal[rows]
+        distance = np.sqrt(np.sum(goal * goal, axis=-1))
+        behind = -(x * goal[:, 0] + y * goal[:, 1]) > _FACING * distance
+        along = np.stack([y, -x], axis=-1)
+        passing = y * planes.speed_x[rows, worst] - x * planes.speed_y[rows, worst]
+        along = np.where((passing < -_ALREADY_PASSING)[:, None], -along, along)
+        lacking = np.maximum(
+            kept.sidestep_speed - np.sum(along * sensed.velocity[rows], axis=-1), 0.0
+        )
+        # Who has arrived stays.
+        progress = np.sum(sensed.velocity[rows] * goal, axis=-1)
+        blocked = (
+            behind
+            & (distance > self.settings.goal_radius)
+            & (progress < kept.blocked_speed * distance)
+        )
+        size = kept.sidestep_rate * blocked * lacking
+        push: FloatArray = size[:, None] * along
+        return push
+
+    def _remembered(
+        self, state: PolicyState, count: int, episode_start: NDArray[np.bool_] | None
+    ) -> tuple[PolicyState, IntArray]:
+        """Return the inner state and the counts so far, which start anew with an episode."""
+        if state is None:
+            return None, np.zeros((count, len(COUNTERS)), np.int64)
+        if not isinstance(state, FilterState) or len(state.counts) != count:
+            raise ValueError(
+                f"state must be what the filter returned for these {count} rows, or None at the "
+                "start of an episode"
+            )
+        if episode_start is None:
+            return state.inner, state.counts
+        starts = np.ravel(episode_start).astype(bool)
+        if len(starts) != count:
+            raise ValueError(f"episode_start has {len(starts)} entries; {count} rows are observed")
+        return state.inner, np.where(starts[:, None], 0, state.counts)
+
+    def _checked(self, wanted: Any, agents: int) -> NDArray[Any]:
+        """Return the inner actions, one row per agent."""
+        actions = np.asarray(wanted)
+        if actions.size != agents * task.THRUSTERS or actions.shape[-1:] != (task.THRUSTERS,):
+            raise ValueError(
+                f"{self.policy.name} answered with shape {actions.shape} for {agents} agents; an "
+                f"action has {task.THRUSTERS} numbers for each"
+            )
+        if not np.all(np.isfinite(actions)):
+            raise ValueError(f"the action of {self.policy.name} is not finite")
+        return actions.reshape(agents, task.THRUSTERS)
+
+    def _sensed(self, observation: NDArray[Any]) -> Sensed:
+        """Return what every agent senses, by rows of worlds and agents, from rows of `state()`.
+
+        The change of heading, which `state()` does not tell and nothing here needs, is zero.
+        """
+        n, m = self.preset.agents, self.layout.obstacles
+        time, states, goals, obstacles, mask = WorldState.of(n, m, observation)
+        worlds = len(time)
+        moving = states[..., PLANE]
+        others = np.array([[j for j in range(n) if j != i] for i in range(n)], np.intp)
+        # One agent alone has one slot for neighbours, which stays empty.
+        neighbours = np.zeros((worlds, n, self.layout.neighbours, 4))
+        neighbours[:, :, : n - 1] = moving[:, others.reshape(n, n - 1)] - moving[:, :, None]
+        seen = np.linalg.norm(neighbours[..., :2], axis=-1) <= self.settings.sensing_radius
+        seen &= n > 1
+        rims = np.repeat(obstacles[:, None], n, axis=1)
+        rims[..., :2] -= states[:, :, None, :2]
+        reach = self.settings.sensing_radius + rims[..., 2]
+        near = (np.linalg.norm(rims[..., :2], axis=-1) <= reach) & mask[:, None]
+        heading = states[..., HEADING]
+        own = (
+            goals - states[..., :2],
+            states[..., VELOCITY_X : VELOCITY_X + 2],
+            np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=-1),
+            states[..., [SPIN]],
+            np.repeat(time[:, None, None], n, axis=1),
+        )
+        return Sensed(
+            np.concatenate(own, axis=-1).reshape(worlds * n, -1),
+            neighbours.reshape(worlds * n, -1, 4),
+            seen.reshape(worlds * n, -1),
+            rims.reshape(worlds * n, -1, OBSTACLE_DIM),
+            near.reshape(worlds * n, -1),
+        )
+
+
+def _body_axes(heading: FloatArray) -> FloatArray:
+    """Return the two axes of bodies at headings (B,) in the world, shape (B, 2, 2)."""
+    sine, cosine = np.sin(heading), np.cos(heading)
+    return np.stack([cosine, -sine, sine, cosine], axis=-1).reshape(-1, 2, 2)

@@ -1,0 +1,111 @@
+"""A spacecraft policy that is one evaluation of a deep set: the common body of (a) and (c)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.tasks.spacecraft import task
+from lagros_envs.tasks.spacecraft.scenarios import Preset
+from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_policies.learning.deep_set import DeepSet
+from lagros_policies.learning.network_policy import PRETRAINED
+from lagros_policies.observed import as_numbers
+from lagros_policies.policy import PolicyState
+from lagros_policies.tasks.spacecraft.features import SpacecraftFeatures, spacecraft_features
+from lagros_policies.tasks.spacecraft.sensed import Sensed
+from lagros_policies.tasks.spacecraft.setup import task_and_preset
+from lagros_policies.tasks.spacecraft.thrusters import allocate
+from lagros_policies.trained_for import PUBLISHED, check_trained_for, spacecraft_range
+
+Float32Array = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+
+
+class SpacecraftNetworkPolicy:
+    """Maps what an agent senses to its eight thrusters by one evaluation of a network.
+
+    The network answers with an acceleration in the frame of the goal; a turn into the body's axes
+    and a fixed last layer with ReLU, the allocation of least norm, make u >= 0 of it. Every row of
+    an observation is an agent of its own: all agents of all worlds fit in one call.
+
+    Args:
+        settings: The task.
+        preset: The preset, or its name: the size of observations and the radii of the bodies.
+        num_agents: Number of agents; None for the preset's own.
+        weights: A safetensors file written by `DeepSet.save`; the shipped one if left out.
+        allow_other_settings: Fly settings and radii too for which the network was not trained.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is damaged, its network is another one or another policy's, or was
+            trained for other settings.
+
+    Attributes:
+        recorded_as: The policy that the file must name; None takes any.
+    """
+
+    name: str = "network"
+    weights_file: str
+    recorded_as: str | None = None
+    restricted = True  # `policy.make` tells it whether other settings are allowed
+    observes: Literal["local", "global"] = "local"
+
+    def __init__(
+        self,
+        settings: task.SpacecraftSettings | None = None,
+        preset: str | Preset = "paper",
+        num_agents: int | None = None,
+        weights: Path | str | None = None,
+        allow_other_settings: bool = False,
+    ) -> None:
+        """Load the network."""
+        self.settings, self.preset = task_and_preset(settings, preset, num_agents)
+        self.layout = Layout.for_preset(self.preset, self.settings)
+        path = PRETRAINED / self.weights_file if weights is None else weights
+        self.network = DeepSet.load(path)
+        check_trained_for(
+            self.network.metadata,
+            str(path),
+            self.recorded_as,
+            (self.settings, self.preset),
+            spacecraft_range(task.SpacecraftSettings(), PUBLISHED),
+            allow_other_settings,
+        )
+        self._radii = self.preset.agent_radius, self.preset.core
+
+    def predict(
+        self,
+        observation: Float32Array,
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, PolicyState]:
+        """Evaluate the network for one agent (o,) or many (B, o); see `Policy.predict`."""
+        rows = as_numbers(observation, np.float32)
+        action = self.thrust(rows) * (1.0 / self.settings.thrust_scale)
+        return (action if rows.ndim == 2 else action[0]).astype(np.float32), state
+
+    def thrust(self, observation: Float32Array) -> FloatArray:
+        """Return u >= 0 of each agent, shape (B, 8) [N], for observations (B, o) or (o,)."""
+        sensed = Sensed.of(self.layout, observation)
+        features = self.features(sensed)
+        wrench = self.network(features).astype(np.float64)
+        body = self.settings.system
+        # Into the world's axes, then into the body's, as complex numbers in place.
+        force = wrench[:, :2].view(np.complex128)[:, 0]
+        force *= features.frame
+        force *= sensed.facing.view(np.complex128)[:, 0]
+        wrench *= (body.mass, body.mass, 2.0 * body.inertia)
+        return allocate(body, wrench)
+
+    def features(self, sensed: Sensed) -> SpacecraftFeatures:
+        """Return the inputs of the network."""
+        return spacecraft_features(sensed, self.settings, *self._radii)
+
+    def bare_forward(self, features: SpacecraftFeatures) -> Float32Array:
+        """Evaluate the network alone, for timing."""
+        return self.network(features)

@@ -1,0 +1,232 @@
+"""The PPO agent that all spacecraft share: what it sees, and its actor as a policy in NumPy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.tasks.spacecraft import task
+from lagros_envs.tasks.spacecraft.scenarios import Preset
+from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_policies.learning.networks import Mlp
+from lagros_policies.policy import PolicyState
+from lagros_policies.tasks.spacecraft.sensed import Sensed
+from lagros_policies.tasks.spacecraft.setup import task_and_preset
+from lagros_policies.tasks.spacecraft.thrusters import allocate
+from lagros_policies.trained_for import check_trained_for, spacecraft_range
+
+Float32Array = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+BoolArray = NDArray[np.bool_]
+
+WEIGHTS = Path(__file__).parents[2] / "pretrained" / "spacecraft_ppo.safetensors"
+TRAINED_IN = ("paper",)  # its features count on the radii of this preset's bodies
+NEAREST = 3  # neighbours, and obstacles, that the agent looks at
+WRENCH = 3  # what it chooses: a force and a torque
+_OWN, _EACH = 5, 8
+FEATURES = _OWN + 2 * _EACH * NEAREST
+# Of an agent [m], and how far beyond a touch it senses a neighbour and an obstacle.
+_RADIUS = 0.25
+_ROOM = (1.5, 1.75)
+# Numbers of the order of one, from metres and metres per second.
+_GOAL_SCALE, _SPEED_SCALE, _RELATIVE_SPEED_SCALE = 0.5, 3.0, 2.0
+# The pull of the goal, one far away, fades within this distance [m].
+_FADE = 0.3
+_SMALLEST = 1e-9
+
+
+class Seen(NamedTuple):
+    """What B agents see, and in which axes.
+
+    Attributes:
+        features: Shape (B, 53).
+        axes: Turns a vector of the frame of the goal into the axes of the body, complex, shape
+            (B,): a force there is this times the network's.
+    """
+
+    features: Float32Array
+    axes: ComplexArray
+
+
+def look(layout: Layout, observation: NDArray[np.floating]) -> Seen:
+    """Return what the agents see: the nearest bodies in the frame whose first axis is to the goal.
+
+    The task has no preferred direction; in this frame each case is learnt once, whatever the
+    heading. Neighbours and obstacles are sorted by distance, so that their order in the observation
+    changes nothing, and the number of features depends neither on that of the agents nor on that of
+    the obstacles.
+
+    Args:
+        layout: Of the environment.
+        observation: Shape (B, layout.size), or (layout.size,) for one.
+
+    Returns:
+        Features, float32: the goal's distance, twice, the velocity (2), the spin; then for each of
+        the three nearest neighbours, and for each of the three nearest obstacles, its direction
+        (2), the same times its nearness (2), its relative velocity (2), its nearness and that times
+        the closing speed. Nearness falls from 1 at a touch of 0.25 m agents to 0 where sensing
+        ends. What is not sensed is zero.
+
+    Raises:
+        ValueError: The observation is not of this layout.
+    """
+    sensed = Sensed.of(layout, observation)
+    # A vector as a complex number is turned by one product.
+    goal: ComplexArray = _complex(sensed.goal) + _SMALLEST
+    way: FloatArray = np.abs(goal)
+    forward: ComplexArray = goal / way
+    turn: ComplexArray = forward.conj()[:, None]
+    velocity = _complex(sensed.velocity) * turn[:, 0]
+    own = [
+        way / (way + _FADE),
+        _GOAL_SCALE * way,
+        *_pair(_SPEED_SCALE * velocity),
+        sensed.spin,
+    ]
+    others = _complex(sensed.neighbours[..., :2]) * turn
+    passing = _complex(sensed.neighbours[..., 2:]) * turn
+    centres = _complex(sensed.obstacles[..., :2]) * turn
+    standing = np.broadcast_to(-velocity[:, None], centres.shape)
+    rims = np.abs(centres) - sensed.obstacles[..., 2]
+    bodies = (
+        (others, passing, np.abs(others) - 2.0 * _RADIUS, sensed.neighbour_mask),
+        (centres, standing, rims - _RADIUS, sensed.obstacle_mask),
+    )
+    features = np.zeros((len(goal), FEATURES), np.float32)
+    features[:, :_OWN] = np.stack(own, axis=1)
+    begin = _OWN
+    for kind, room in zip(bodies, _ROOM, strict=True):
+        nearest = _nearest(*kind, room)
+        features[:, begin : begin + nearest.shape[1]] = nearest
+        begin += _EACH * NEAREST
+    # The body's axes are (cos phi, -sin phi) and (sin phi, cos phi).
+    return Seen(features, np.exp(1j * sensed.heading) * forward)
+
+
+def _nearest(
+    places: ComplexArray, motions: ComplexArray, gaps: FloatArray, mask: BoolArray, room: float
+) -> FloatArray:
+    """Return the features of the nearest bodies of one kind, fewer where there are fewer slots."""
+    order = np.argsort(np.where(mask, gaps, np.inf), axis=1, kind="stable")[:, :NEAREST]
+    place = np.take_along_axis(places, order, axis=1)
+    gap = np.take_along_axis(gaps, order, axis=1)
+    seen = np.take_along_axis(mask, order, axis=1)
+    direction: ComplexArray = place / np.maximum(np.abs(place), _SMALLEST)
+    nearness: FloatArray = np.where(seen, np.maximum(1.0 - gap / room, 0.0), 0.0)
+    motion: ComplexArray = np.take_along_axis(motions, order, axis=1)
+    motion = seen * _RELATIVE_SPEED_SCALE * motion
+    closing = -(direction.conj() * motion).real
+    each = [
+        *_pair(direction),
+        *_pair(direction * nearness),
+        *_pair(motion),
+        nearness,
+        closing * nearness,
+    ]
+    table: FloatArray = np.stack(each, axis=-1).reshape(len(places), -1)
+    return table
+
+
+def _complex(vectors: FloatArray) -> ComplexArray:
+    value: ComplexArray = vectors[..., 0] + 1j * vectors[..., 1]
+    return value
+
+
+def _pair(values: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    return values.real, values.imag
+
+
+def thrust_of(
+    settings: task.SpacecraftSettings, axes: ComplexArray, action: NDArray[np.floating]
+) -> Float32Array:
+    """Return the thrusts of least norm for a force in the frame of the goal and a torque.
+
+    Args:
+        settings: The task.
+        axes: Of `look`, shape (B,).
+        action: Force (2) and torque, shape (B, 3), in units of 1 N and 1 N m, each clipped to one.
+
+    Returns:
+        The action of the environment, shape (B, 8), in units of `settings.thrust_scale`.
+    """
+    wrench = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
+    wrench[:, :2] = np.stack(_pair(axes * _complex(wrench[:, :2])), axis=1)
+    return (allocate(settings.system, wrench) / settings.thrust_scale).astype(np.float32)
+
+
+class SpacecraftPpoPolicy:
+    """The trained actor, its mean action, for any number of agents.
+
+    `lagros train spacecraft --algo ppo` trains it, with six agents in the preset `paper`.
+
+    Args:
+        settings: The task; None for the paper's.
+        preset: The preset, or its name, of the environment.
+        num_agents: Number of agents; None for the preset's own.
+        weights: The file of a training, or the network itself; None for the shipped one.
+        allow_other_settings: Fly settings and radii too for which the agent was not trained.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is damaged, not this agent's, or of a training for other settings.
+    """
+
+    name = "ppo"
+    restricted = True  # `policy.make` tells it whether other settings are allowed
+    observes: Literal["local", "global"] = "local"
+
+    def __init__(
+        self,
+        settings: task.SpacecraftSettings | None = None,
+        preset: str | Preset = "paper",
+        num_agents: int | None = None,
+        weights: Path | str | Mlp | None = None,
+        allow_other_settings: bool = False,
+    ) -> None:
+        """Load the actor."""
+        self.settings, chosen = task_and_preset(settings, preset, num_agents)
+        self.layout = Layout.for_preset(chosen, self.settings)
+        file = WEIGHTS if weights is None else weights
+        self.network = file if isinstance(file, Mlp) else Mlp.load(file)
+        if (self.network.inputs, self.network.outputs) != (FEATURES, WRENCH):
+            raise ValueError(
+                f"the network maps {self.network.inputs} numbers to {self.network.outputs}; this "
+                f"agent maps {FEATURES} to {WRENCH}; `lagros train spacecraft` makes such a network"
+            )
+        check_trained_for(
+            self.network.metadata,
+            "the network" if isinstance(file, Mlp) else str(file),
+            self.name,
+            (self.settings, chosen),
+            spacecraft_range(task.SpacecraftSettings(), TRAINED_IN),
+            allow_other_settings,
+        )
+
+    def predict(
+        self,
+        observation: Float32Array,
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, PolicyState]:
+        """Choose the thrusts; see `Policy.predict`.
+
+        Args:
+            observation: Of one agent (o,), or of many (B, o).
+            state: Is passed on: the actor remembers nothing.
+            episode_start: Has no effect.
+            deterministic: Has no effect: this is the mean action.
+
+        Returns:
+            The actions (8,) or (B, 8) within [0, 1], and the state.
+
+        Raises:
+            ValueError: The observation is not of this task.
+        """
+        seen = look(self.layout, observation)
+        thrust = thrust_of(self.settings, seen.axes, self.network(seen.features))
+        return (thrust if np.ndim(observation) == 2 else thrust[0]), state

@@ -1,0 +1,174 @@
+"""What the rows of a spacecraft observation or global state mean: their named parts as arrays."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.tasks.spacecraft.sensing import NEIGHBOUR_DIM, OBSTACLE_DIM, Layout
+from lagros_envs.tasks.spacecraft.task import STATE_DIM
+from lagros_policies.observed import as_numbers
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+class Sensed(NamedTuple):
+    """The observations o_l of some agents, by parts; B rows, k neighbours, m obstacles.
+
+    Slots of what is not sensed are zero, and so is their mask. The parts are views: policies that
+    decide within microseconds take only those that they need.
+
+    Attributes:
+        own: What an agent knows of itself, shape (B, 9); its columns have names below.
+        neighbours: Positions and velocities relative to the agent, shape (B, k, 4) [m, m/s].
+        neighbour_mask: Which neighbours are sensed, shape (B, k).
+        obstacles: Centres relative to the agent and radii, shape (B, m, 3) [m].
+        obstacle_mask: Which obstacles are sensed, shape (B, m).
+    """
+
+    own: FloatArray
+    neighbours: FloatArray
+    neighbour_mask: BoolArray
+    obstacles: FloatArray
+    obstacle_mask: BoolArray
+
+    @property
+    def goal(self) -> FloatArray:
+        """Goal relative to the agent, shape (B, 2) [m]."""
+        return self.own[:, 0:2]
+
+    @property
+    def velocity(self) -> FloatArray:
+        """Velocity, shape (B, 2) [m/s]."""
+        return self.own[:, 2:4]
+
+    @property
+    def facing(self) -> FloatArray:
+        """Heading as (cos phi, sin phi), shape (B, 2)."""
+        return self.own[:, 4:6]
+
+    @property
+    def heading(self) -> FloatArray:
+        """Heading phi in (-pi, pi], shape (B,) [rad]."""
+        heading: FloatArray = np.arctan2(self.own[:, 5], self.own[:, 4])
+        return heading
+
+    @property
+    def heading_change(self) -> FloatArray:
+        """Turn of the heading since the start, shape (B,) [rad]."""
+        return self.own[:, 6]
+
+    @property
+    def spin(self) -> FloatArray:
+        """Turning rate omega, shape (B,) [rad/s]."""
+        return self.own[:, 7]
+
+    @property
+    def time(self) -> FloatArray:
+        """Time t since the start, shape (B,) [s]."""
+        return self.own[:, 8]
+
+    @classmethod
+    def of(cls, layout: Layout, observation: NDArray[np.floating]) -> Sensed:
+        """Take observations apart.
+
+        Args:
+            layout: Of the environment: `Layout.for_preset(preset, settings)`.
+            observation: Shape (B, layout.size), or (layout.size,) for one row.
+
+        Returns:
+            The parts, in double precision.
+
+        Raises:
+            ValueError: The observation has another shape, no rows, or is not finite.
+        """
+        rows = as_numbers(observation, np.float64)
+        if rows.ndim == 1:
+            rows = rows[None]
+        if rows.ndim != 2 or rows.shape[1] != layout.size:
+            raise ValueError(
+                f"the observation has shape {np.shape(observation)}; with {layout.neighbours} "
+                f"neighbours and {layout.obstacles} obstacles at most it has {layout.size} numbers:"
+                " build the policy with the environment's preset and num_agents"
+            )
+        _check_rows(rows)
+        at, count = layout.slices, len(rows)
+        return cls(
+            rows[:, : at["neighbours"].start],
+            rows[:, at["neighbours"]].reshape(count, -1, NEIGHBOUR_DIM),
+            rows[:, at["neighbour_mask"]] > 0.0,
+            rows[:, at["obstacles"]].reshape(count, -1, OBSTACLE_DIM),
+            rows[:, at["obstacle_mask"]] > 0.0,
+        )
+
+
+class WorldState(NamedTuple):
+    """The global states `state()` of some worlds, by parts; B worlds, n agents, m obstacles.
+
+    Attributes:
+        time: t, shape (B,) [s].
+        states: x of every agent, shape (B, n, 6).
+        goals: Shape (B, n, 2) [m].
+        obstacles: Centres and radii, shape (B, m, 3) [m]; zero in slots without an obstacle.
+        obstacle_mask: Which slots have one, shape (B, m).
+    """
+
+    time: FloatArray
+    states: FloatArray
+    goals: FloatArray
+    obstacles: FloatArray
+    obstacle_mask: BoolArray
+
+    @classmethod
+    def of(cls, agents: int, obstacles: int, observation: NDArray[np.floating]) -> WorldState:
+        """Take global states apart; `observation.named_state_space` says how they are laid out.
+
+        Args:
+            agents: n, agents in a world.
+            obstacles: m, slots for obstacles.
+            observation: Shape (B, size), or (size,) for one world.
+
+        Returns:
+            The parts, in double precision.
+
+        Raises:
+            ValueError: The observation has another shape, no rows, is not finite, or is no global
+                state.
+        """
+        ends = np.cumsum(
+            [1, STATE_DIM * agents, 2 * agents, OBSTACLE_DIM * obstacles, obstacles]
+        ).tolist()
+        rows = as_numbers(observation, np.float64)
+        if rows.ndim == 1:
+            rows = rows[None]
+        if rows.ndim != 2 or rows.shape[1] != ends[-1]:
+            raise ValueError(
+                f"the observation has shape {np.shape(observation)}; the state() of {agents} agents"
+                f" and up to {obstacles} obstacles has {ends[-1]} numbers: build the policy with "
+                "the environment's preset and num_agents, and its filter too"
+            )
+        _check_rows(rows)
+        time, states, goals, discs, mask = np.split(rows, ends[:-1], axis=1)
+        if not np.isin(mask, (0.0, 1.0)).all():
+            raise ValueError(
+                f"the observation is not the state() of {agents} agents and up to {obstacles} "
+                "obstacles: the obstacles' mask is neither 0 nor 1"
+            )
+        worlds = len(rows)
+        return cls(
+            time[:, 0],
+            states.reshape(worlds, agents, STATE_DIM),
+            goals.reshape(worlds, agents, 2),
+            discs.reshape(worlds, obstacles, OBSTACLE_DIM),
+            mask > 0.0,
+        )
+
+
+def _check_rows(rows: FloatArray) -> None:
+    if not len(rows):
+        raise ValueError("the observation has no rows: no one is there to act")
+    if not np.isfinite(rows).all():
+        raise ValueError("the observation is not finite")

@@ -1,0 +1,78 @@
+"""Which spacecraft a policy is for: what its policies share of settings, preset and state."""
+
+from __future__ import annotations
+
+import math
+
+from lagros_envs.conventions import settings_of
+from lagros_envs.tasks.spacecraft.scenarios import Preset, preset_named
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+
+# Position and velocity in the state: plans lie in the plane, at a heading that rests.
+PLANE = [0, 1, 3, 4]
+# Two agents err independently, so that their distance errs sqrt(2) times as far.
+PAIR_SHARE = math.sqrt(2.0)
+
+
+def task_and_preset(
+    settings: SpacecraftSettings | None, preset: str | Preset, num_agents: int | None
+) -> tuple[SpacecraftSettings, Preset]:
+    """Return what the first three arguments of every policy of the spacecraft mean.
+
+    Args:
+        settings: The task; None for the paper's.
+        preset: The preset, or its name.
+        num_agents: Number of agents; None for the preset's own.
+
+    Returns:
+        The task, and the preset with that many agents.
+
+    Raises:
+        ValueError: The settings are none, there is no such preset, or the number of agents is less
+            than 1.
+    """
+    return (
+        settings_of(SpacecraftSettings(), settings),
+        preset_named(preset).for_agents(num_agents),
+    )
+
+
+def plan_force_limit(settings: SpacecraftSettings, disturbance_bound: float) -> float | None:
+    """Return the largest force per axis of the world that plans may use [N], at any heading.
+
+    Two thrusters push along each axis of the body. Of their force, what a disturbance can take is
+    left to u*; the rest is a disc of forces, and this the square within it.
+
+    Args:
+        settings: The task.
+        disturbance_bound: d_bar to prepare for, in units of the state per second.
+
+    Returns:
+        The force; None where the task has no thrust limit.
+
+    Raises:
+        ValueError: Nothing is left.
+    """
+    if settings.thrust_limit is None:
+        return None
+    whole, reserve = 2.0 * settings.thrust_limit, settings.system.mass * disturbance_bound
+    if whole <= reserve:
+        raise ValueError(
+            f"thrust_limit={settings.thrust_limit!r} N leaves plans no force: two thrusters push "
+            f"with {whole:g} N, and disturbance_bound={disturbance_bound!r} can take {reserve:g} N;"
+            " raise the limit, or prepare for a smaller bound"
+        )
+    return (whole - reserve) / math.sqrt(2.0)
+
+
+def check_planner_force(force_limit: float | None, allowed: float | None) -> None:
+    """Check the force limit of a planner that the user gives against what the thrusters leave.
+
+    Raises:
+        ValueError: The planner may use more.
+    """
+    if allowed is not None and (force_limit is None or force_limit > allowed):
+        raise ValueError(
+            f"the planner has force_limit={force_limit!r} N; the task's thrust_limit leaves plans "
+            f"{allowed:g} N"
+        )
