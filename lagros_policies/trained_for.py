@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_flag
-from lagros_envs.dynamics import CartPole
 from lagros_envs.reading import parse_json
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.spacecraft.scenarios import Preset, preset_named
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import check_above, check_whole, shown
 from lagros_envs.conventions import settings_of
-from lagros_envs.dynamics import CartPole
 from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction import ContractionMetric, load_metric
 from lagros_policies.observed import cartpole_rows
 from lagros_policies.planning import Trajectory

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lagros_envs.dynamics.integrate import rk4_hold
 from lagros_envs.tasks.cartpole.physics import ANGLE
-from lagros_policies.planning import CartPolePlanner
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner
 
 FloatArray = NDArray[np.float64]
 

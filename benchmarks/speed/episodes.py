@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.tasks.cartpole import task
-from lagros_policies.planning import CartPolePlanner, CartPolePlannerSettings, Trajectory
+from lagros_policies.planning import Trajectory
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner, CartPolePlannerSettings
 from speed.timing import Candidate, Scale
 
 if TYPE_CHECKING:

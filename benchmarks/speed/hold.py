@@ -8,11 +8,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import CartPole, Spacecraft, hold_step
+from lagros_envs.dynamics import hold_step
 from lagros_envs.dynamics.held import HeldBatch, HeldStep
 from lagros_envs.dynamics.integrate import SUBSTEPS, rk4_hold
 from lagros_envs.dynamics.straight_line import recorded_hold
 from lagros_envs.dynamics.system import System
+from lagros_envs.tasks.cartpole.physics import CartPole
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from speed.report import Row, Section, timed_row
 from speed.timing import Candidate, Scale, interleave
 

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lagros_policies.planning import CartPolePlannerSettings, ScpSettings, Trajectory
+from lagros_policies.planning import ScpSettings, Trajectory
 from lagros_policies.planning.qp import QpSolution, QuadraticProgram, solve_qp, solve_with_clarabel
+from lagros_policies.tasks.cartpole.planner import CartPolePlannerSettings
 from speed import qp_solvers
 from speed.episodes import Bench
 from speed.report import Row, Section, timed_row

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from lagros_benchmarks.run.metrics import mean_interval, wilson_interval
 from lagros_envs.disturbances import Disturbance
-from lagros_envs.dynamics import CartPole, hold_step
+from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 FloatArray = NDArray[np.float64]

@@ -24,8 +24,8 @@ from rich.console import Console
 from rich.table import Table
 from studies.rollouts import plan_episodes
 
-from lagros_envs.dynamics import Spacecraft
 from lagros_envs.files import write_atomic
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.contraction.control import error_energy
 from lagros_policies.contraction.double_integrator import design_axis
 from lagros_policies.remarks.stochastic import (

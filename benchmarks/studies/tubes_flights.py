@@ -20,7 +20,7 @@ from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction.ellipsoid import TubeControl
 from lagros_policies.contraction.held_design import HeldTube
 from lagros_policies.contraction.tube_design import ConstantTube, PlanBox
-from lagros_policies.planning import CartPolePlanner
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

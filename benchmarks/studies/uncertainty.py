@@ -30,10 +30,10 @@ from studies.rollouts import Episodes, Law, fly, measures, plan_episodes
 
 from lagros_benchmarks.report.canvas import canvas, check_figure_path, curve, save, styles
 from lagros_benchmarks.run.metrics import cluster_rate_interval
-from lagros_envs.dynamics import CartPole
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.actor import PpoPolicy
 from lagros_policies.baselines import LqrPolicy

@@ -52,8 +52,8 @@ from lagros_policies.contraction.held_design import HeldDesign, HeldTube, design
 from lagros_policies.contraction.held_ellipsoid import prove_held_tube
 from lagros_policies.contraction.tube_design import PlanBox
 from lagros_policies.lagros import LagrosPolicy
-from lagros_policies.planning import CartPolePlanner
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

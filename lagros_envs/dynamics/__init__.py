@@ -1,8 +1,7 @@
-"""Equations of motion, written once, and what is derived from them.
+"""What follows from an equation of motion that is written once.
 
-`cartpole` and `spacecraft` hold the physics; `integrate` holds a control over one step; `system`
-derives drift, control matrix, Jacobians and the SDC matrix for any system; `check` tries a system
-of your own on every kind of number.
+`integrate` holds a control over one step; `system` derives drift, control matrix, Jacobians and the
+SDC matrix for any system; `check` tries a system of your own on every kind of number;
 `straight_line`, `held` and `compiled` run a held step without the overhead of calling the two.
 """
 
@@ -17,14 +16,10 @@ from lagros_envs.dynamics.system import (
     state_dependent_coefficient,
     vector_field,
 )
-from lagros_envs.tasks.cartpole.physics import CartPole
-from lagros_envs.tasks.spacecraft.physics import Spacecraft
 
 __all__ = [
-    "CartPole",
     "Components",
     "Functions",
-    "Spacecraft",
     "System",
     "check_system",
     "control_matrix",

@@ -16,8 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import CartPole, control_matrix, vector_field
+from lagros_envs.dynamics import control_matrix, vector_field
 from lagros_envs.numbers import Interval, exact
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.regions import Region
 from lagros_policies.contraction.systems import check_cartpole

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import CartPole
 from lagros_envs.numbers import Interval, exact
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction.held_design import HeldTube, bernstein_rate
 from lagros_policies.contraction.statement import Statement, at_most
 from lagros_policies.contraction.systems import check_cartpole

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import shown
-from lagros_envs.dynamics import CartPole, System
-from lagros_envs.tasks.cartpole.physics import ANGLE
+from lagros_envs.dynamics import System
+from lagros_envs.tasks.cartpole.physics import ANGLE, CartPole
 from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.contraction.basis import Basis, cosines
 from lagros_policies.contraction.metric import DualMetric, Metric

@@ -30,12 +30,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_at_least, check_not_negative, check_positive
-from lagros_envs.dynamics import (
-    CartPole,
-    System,
-    control_matrix,
-)
+from lagros_envs.dynamics import System, control_matrix
 from lagros_envs.numbers import Interval, exact, variable
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction.condition import Samples, condition_left
 from lagros_policies.contraction.control import contraction_terms
 from lagros_policies.contraction.metric import DualMetric, Metric, metric_place

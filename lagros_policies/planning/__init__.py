@@ -4,11 +4,8 @@ from lagros_policies.planning.guess import PlannerSettings, plan_trajectory
 from lagros_policies.planning.problem import Discs, Problem
 from lagros_policies.planning.scp import ScpSettings, solve_scp
 from lagros_policies.planning.trajectory import Trajectory
-from lagros_policies.tasks.cartpole.planner import CartPolePlanner, CartPolePlannerSettings
 
 __all__ = [
-    "CartPolePlanner",
-    "CartPolePlannerSettings",
     "Discs",
     "PlannerSettings",
     "Problem",

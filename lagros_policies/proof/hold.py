@@ -27,10 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_positive
-from lagros_envs.dynamics import CartPole
 from lagros_envs.dynamics.integrate import rk4_hold
 from lagros_envs.numbers import Interval, Series, dual, exact, functions, variable
-from lagros_envs.tasks.cartpole.physics import ANGLE
+from lagros_envs.tasks.cartpole.physics import ANGLE, CartPole
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 from lagros_policies.proof.box import ProofBox

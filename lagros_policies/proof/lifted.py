@@ -16,9 +16,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import CartPole
 from lagros_envs.numbers import Interval, exact
-from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY
+from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY, CartPole
 from lagros_policies.contraction.systems import check_cartpole
 from lagros_policies.proof.box import ProofBox
 from lagros_policies.proof.cells import Examined, grid, remainder

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import CartPole
 from lagros_envs.numbers import Dual, Interval, Series, exact, functions, variable
-from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, POSITION, VELOCITY
+from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, POSITION, VELOCITY, CartPole
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 from lagros_policies.proof.matrices import matmul, transpose

@@ -21,9 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import CartPole
 from lagros_envs.numbers import Interval, exact, variable
-from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY
+from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY, CartPole
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
 from lagros_policies.proof.box import ProofBox

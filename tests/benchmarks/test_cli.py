@@ -66,7 +66,7 @@ def test_a_mistake_is_explained_with_status_2_and_no_traceback(invoke, arguments
 def test_a_table_without_episodes_is_refused_before_anything_is_made(
     invoke, tmp_path, monkeypatch, task, options
 ):
-    for name in ("reproduction.reproduce", "cli.run_and_report"):
+    for name in ("run.reproduction.reproduce", "commands.cli.run_and_report"):
         monkeypatch.setattr(f"lagros_benchmarks.{name}", lambda *_: pytest.fail("it began"))
     result = invoke("reproduce", task, *options, "--jobs", "1")
     assert result.exit_code == 2

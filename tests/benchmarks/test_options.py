@@ -259,16 +259,16 @@ def invoke(tmp_path, monkeypatch):
         raise BeganError
 
     for place in (
-        "cli.run_and_report",
-        "reproduction.reproduce",
-        "playback.Playback.play",
-        "certify_evidence.cartpole_proofs",
-        "certify_evidence.fly_cartpole",
-        "certify_evidence.fly_spacecraft",
-        "train._train_one",
+        "commands.cli.run_and_report",
+        "run.reproduction.reproduce",
+        "report.playback.Playback.play",
+        "evidence.evidence.cartpole_proofs",
+        "evidence.evidence.fly_cartpole",
+        "evidence.evidence.fly_spacecraft",
+        "commands.train._train_one",
         "worst_case.attack.run_attack",
         "worst_case.attack.fly_again",
-        "export._written",
+        "commands.export._written",
     ):
         monkeypatch.setattr(f"lagros_benchmarks.{place}", begin)
     monkeypatch.setattr("lagros_policies.learning.demonstrations.demonstrate", begin)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from studies.rollouts import fly, measures, plan_episodes
 
-from lagros_envs.dynamics import CartPole
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
 from lagros_policies.baselines import LqrPolicy
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert

@@ -9,8 +9,9 @@ from gymnasium import spaces
 
 import lagros_envs  # noqa: F401 - registers the ids
 from lagros_envs.disturbances import KINDS, OPEN_LOOP
-from lagros_envs.dynamics import CartPole, hold_step
+from lagros_envs.dynamics import hold_step
 from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tube import PaperTube
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import lagros_envs  # noqa: F401 - registers the ids
-from lagros_envs.dynamics import CartPole
 from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 
 pygame_only = pytest.mark.skipif(

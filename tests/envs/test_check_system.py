@@ -6,7 +6,9 @@ import random
 import numpy as np
 import pytest
 
-from lagros_envs.dynamics import CartPole, Spacecraft, check_system
+from lagros_envs.dynamics import check_system
+from lagros_envs.tasks.cartpole.physics import CartPole
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
 
 
 class Pendulum:

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lagros_envs.dynamics import (
-    CartPole,
     control_matrix,
     hold_step,
     jacobian,
@@ -21,6 +20,7 @@ from lagros_envs.dynamics import (
 )
 from lagros_envs.dynamics.integrate import SUBSTEPS, rk4_hold
 from lagros_envs.numbers import dual, functions
+from lagros_envs.tasks.cartpole.physics import CartPole
 
 PERIOD = 0.1
 # Not the defaults, and all different, so that no two parameters can be mistaken for each other.

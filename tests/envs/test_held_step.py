@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 
 import lagros_envs  # noqa: F401 - registers the ids
-from lagros_envs.dynamics import CartPole, Spacecraft, compiled, hold_step
+from lagros_envs.dynamics import compiled, hold_step
 from lagros_envs.dynamics.held import HeldBatch, HeldStep, has_numba
 from lagros_envs.dynamics.integrate import rk4_hold
 from lagros_envs.dynamics.straight_line import ArrayFunction, straight_line
 from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.physics import CartPole
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
 
 ODD = CartPole(cart_mass=2.3, pole_mass=0.4, half_length=0.7, cart_friction=0.0)
 SYSTEMS = [

@@ -13,9 +13,10 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 
 from lagros_envs.conventions import settings_of
-from lagros_envs.dynamics import CartPole, Spacecraft
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.spacecraft import scenarios
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_envs.tasks.spacecraft.scenarios import PRESETS
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tube import PaperTube

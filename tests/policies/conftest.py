@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lagros_envs.dynamics import CartPole
 from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction import CvStemSettings, Region, Samples, design_on_pool
 from lagros_policies.learning.networks import Mlp
-from lagros_policies.planning import CartPolePlanner
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner
 
 ROOT = Path(__file__).resolve().parents[2]
 PERIOD = 0.1

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from lagros_envs.dynamics import CartPole
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction import Samples
 
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lagros_envs.dynamics import CartPole, hold_step
+from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction import HeldControl, load_metric
 from lagros_policies.contraction.control import error_energy
-from lagros_policies.planning import CartPolePlanner
 from lagros_policies.remarks.adaptive import (
     AdaptiveControl,
     cart_mass_regressor,
@@ -18,6 +18,7 @@ from lagros_policies.remarks.adaptive import (
     largest_gain,
     slope_regressor,
 )
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner
 
 PERIOD, MODEL = 0.1, CartPole()
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lagros_envs.dynamics import Spacecraft, jacobian
+from lagros_envs.dynamics import jacobian
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.contraction import Region, load_metric
 from lagros_policies.contraction.double_integrator import design_axis
 from lagros_policies.contraction.statement import Statement

@@ -23,7 +23,7 @@ from lagros_policies.learning.demonstrations import (
     fly,
     make_expert,
 )
-from lagros_policies.planning import CartPolePlanner
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
 SETTINGS = DemonstrationSettings(episodes=2, seed=4, disturbance="gust", bound=0.5)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
-from lagros_policies.planning import CartPolePlanner
 from lagros_policies.tasks.cartpole.metric_design import MetricDesignSettings, tube_samples
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner
 
 
 def test_plans_that_failed_are_not_surrounded(monkeypatch):

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lagros_envs.dynamics import Spacecraft, hold_step
+from lagros_envs.dynamics import hold_step
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.remarks.lagrangian import (
     SlidingAxis,
     SlidingTracking,

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lagros_envs.dynamics import CartPole
 from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction import (
     CvStemSettings,
     HeldControl,

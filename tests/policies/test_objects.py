@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from lagros_envs import spacecraft_v0
-from lagros_envs.dynamics import CartPole
 from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies import NAMES, make

@@ -13,8 +13,8 @@ import pytest
 import lagros_envs  # noqa: F401
 import lagros_policies
 from lagros_benchmarks.run.library import position_margin
-from lagros_envs.dynamics import CartPole
 from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.control import HeldControl
 from lagros_policies.remarks.lagrangian import SlidingAxis, steady_position_bound

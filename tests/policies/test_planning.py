@@ -7,7 +7,8 @@ import scipy.optimize
 
 from lagros_envs.tasks.cartpole import task
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
-from lagros_policies.planning import CartPolePlanner, CartPolePlannerSettings, ScpSettings
+from lagros_policies.planning import ScpSettings
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner, CartPolePlannerSettings
 
 UPRIGHT = np.zeros(4)
 

@@ -137,11 +137,7 @@ print(*failed)
     [
         ("clarabel", {"tube-mpc", "centralized"}),
         ("piqp", {"tube-mpc", "centralized"}),
-        # Of the networks, those that stand beside the spacecraft's, which the allocation needs.
-        (
-            "scipy",
-            {"lqr", "tube-mpc", "centralized", "learned", "lagros", "residual", "ppo"},
-        ),
+        ("scipy", {"lqr", "tube-mpc", "centralized", "learned"}),
         ("safetensors", {"learned", "lagros", "ppo", "sac", "td3", "residual"}),
         ("torch", set()),
         ("cvxpy", set()),

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lagros_policies
-from lagros_envs.dynamics import CartPole
 from lagros_envs.numbers import Interval
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction import Region, Samples, contraction_residual, load_metric
 from lagros_policies.proof.condition import (
     ProofBox,

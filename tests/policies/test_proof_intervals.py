@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lagros_envs.dynamics import CartPole
 from lagros_envs.numbers import Interval, exact
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.proof.matrices import interval_jacobian, matmul
 
 NUMBERS = st.floats(-1e6, 1e6)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from lagros_envs.tasks.cartpole.task import FALL_ANGLE, CartPoleSettings
-from lagros_policies.planning import CartPolePlanner, Problem, solve_scp
+from lagros_policies.planning import Problem, solve_scp
 from lagros_policies.planning.local.plan import LocalPlanner
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
-from lagros_policies.tasks.cartpole.planner import CartPolePlannerSettings
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner, CartPolePlannerSettings
 from lagros_policies.tasks.spacecraft.distributed import DistributedTubeMpcPolicy
 from lagros_policies.tube_mpc import TubeMpcPolicy
 

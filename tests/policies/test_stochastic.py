@@ -5,7 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lagros_envs.dynamics import CartPole, Spacecraft, hold_step
+from lagros_envs.dynamics import hold_step
+from lagros_envs.tasks.cartpole.physics import CartPole
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.contraction import load_metric
 from lagros_policies.contraction.control import error_energy
 from lagros_policies.contraction.double_integrator import AxisMetric, design_axis

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lagros_envs import spacecraft_v0
-from lagros_envs.dynamics import CartPole
 from lagros_envs.tasks.cartpole.env import CartPoleEnv
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Preset

@@ -8,7 +8,7 @@ import pytest
 
 import lagros_envs  # noqa: F401  registers the environment
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
-from lagros_policies.planning import CartPolePlanner
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
 SHORT = CartPoleSettings(time_limit=3.0, goal_range=1.0)

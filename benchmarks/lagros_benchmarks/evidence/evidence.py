@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lagros_policies
-from lagros_envs.dynamics import CartPole, System
+from lagros_envs.dynamics import System
 from lagros_envs.reading import MOST_TEXT, Record, named, parse_json, read_bytes
-from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY
+from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY, CartPole
 from lagros_policies.contraction import Metric, Samples
 from lagros_policies.contraction.certificate import Certificate
 from lagros_policies.contraction.cvstem import InfeasibleError

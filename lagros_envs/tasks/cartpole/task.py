@@ -24,10 +24,10 @@ from lagros_envs.checks import (
     check_not_negative,
     check_positive,
 )
-from lagros_envs.dynamics import CartPole
 from lagros_envs.numbers.functions import where
 from lagros_envs.options import nominal_option, option_numbers
 from lagros_envs.task import Scenario, Task
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tube import PaperTube
 from lagros_envs.values import ByValue, use_plain_numbers
 

@@ -15,8 +15,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import CartPole
-from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY
+from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY, CartPole
 from lagros_policies.contraction.certificate import Certificate, Stopwatch, TubeSizes
 from lagros_policies.contraction.condition import Samples
 from lagros_policies.contraction.ellipsoid import prove_tube

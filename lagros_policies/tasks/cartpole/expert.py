@@ -16,7 +16,7 @@ from lagros_policies.contraction.feedback import (
     gain_table,
     preferred_deviation,
 )
-from lagros_policies.planning import CartPolePlanner
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

@@ -20,7 +20,7 @@ from lagros_policies.contraction import (
     verify_metric,
 )
 from lagros_policies.contraction.regions import joined
-from lagros_policies.planning import CartPolePlanner
+from lagros_policies.tasks.cartpole.planner import CartPolePlanner
 
 FloatArray = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 
-from lagros_envs.dynamics import CartPole
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.statement import Statement, at_most
 from lagros_policies.proof.cells import Search, search

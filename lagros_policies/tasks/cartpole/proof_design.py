@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from lagros_envs.dynamics import CartPole
 from lagros_envs.files import write_atomic
+from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.metric_files import metric_record
 from lagros_policies.proof.rates import Violation

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from lagros_envs.checks import check_fields
-from lagros_envs.dynamics import CartPole, control_matrix, jacobian, linearise_hold
-from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY
+from lagros_envs.dynamics import control_matrix, jacobian, linearise_hold
+from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY, CartPole
 from lagros_policies.contraction.basis import cosine_powers, cosine_rates
 from lagros_policies.contraction.cvstem import CvStemSettings, InfeasibleError
 from lagros_policies.contraction.metric import Metric

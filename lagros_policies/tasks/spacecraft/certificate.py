@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import Spacecraft
+from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.contraction.certificate import Certificate, Stopwatch, TubeSizes
 from lagros_policies.contraction.double_integrator import (
     AxisMetric,
