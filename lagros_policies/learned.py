@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from lagros_policies.learning.network_policy import NetworkPolicy
-from lagros_policies.tasks.spacecraft.network_policy import SpacecraftNetworkPolicy
 
 
 class LearnedPolicy(NetworkPolicy):
@@ -11,10 +10,3 @@ class LearnedPolicy(NetworkPolicy):
 
     name = recorded_as = "learned"
     weights_file = "cartpole_learned.safetensors"
-
-
-class SpacecraftLearnedPolicy(SpacecraftNetworkPolicy):
-    """o_l -> u_d of each spacecraft, learned on undisturbed plans."""
-
-    name = recorded_as = "learned"
-    weights_file = "spacecraft_learned.safetensors"

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_flag, shown, suggestion
-from lagros_envs.tasks.spacecraft.scenarios import preset_named
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.naming import UserClass, model_file, user_class
+from lagros_policies.tasks.spacecraft import POLICIES as _SPACECRAFT
+from lagros_policies.tasks.spacecraft import told
 from lagros_policies.wrappers import bare_environment
 
 Float32Array = NDArray[np.float32]
@@ -31,13 +32,6 @@ _CARTPOLE = {
     "sac": "lagros_policies.actor:SacPolicy",
     "td3": "lagros_policies.actor:Td3Policy",
     "residual": "lagros_policies.residual:ResidualPolicy",
-}
-_SPACECRAFT = {
-    "learned": "lagros_policies.learned:SpacecraftLearnedPolicy",
-    "tube-mpc": "lagros_policies.tasks.spacecraft.distributed:DistributedTubeMpcPolicy",
-    "lagros": "lagros_policies.lagros:SpacecraftLagrosPolicy",
-    "centralized": "lagros_policies.tasks.spacecraft.centralized:CentralizedPolicy",
-    "ppo": "lagros_policies.tasks.spacecraft.ppo:SpacecraftPpoPolicy",
 }
 NAMES = tuple(_CARTPOLE)
 SPACECRAFT_NAMES = tuple(_SPACECRAFT)
@@ -158,10 +152,7 @@ def make(
         raise _of_the_environment("settings")
     if isinstance(world.settings, SpacecraftSettings):
         classes = _SPACECRAFT
-        preset = preset_named(settings.get("preset", world.preset))
-        if preset.for_agents(settings.get("num_agents")) != world.preset:
-            raise _of_the_environment("preset" if "preset" in settings else "num_agents")
-        settings = {"preset": world.preset, **settings}
+        settings = told(world, settings)
     else:
         classes = _CARTPOLE
     if name in classes:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -18,19 +18,14 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import check_flag
 from lagros_envs.reading import parse_json
+from lagros_envs.task import Described
 from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
-from lagros_envs.tasks.spacecraft.scenarios import Preset, preset_named
-from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 
 TASK, POLICY, SETTINGS = KEYS = ("task", "policy", "trained_for")
 Rule = Literal["equal", "at_most", "one_of"]
 # By rule and by name, what the settings of a flight are held against.
 Range = Mapping[str, Mapping[str, Any]]
-
-# Presets whose bodies the shipped networks of the spacecraft met in training or in what is
-# published about them.
-PUBLISHED = ("paper", "released")
 
 
 def cartpole_range(task: CartPoleSettings, timed: bool) -> Range:
@@ -40,7 +35,7 @@ def cartpole_range(task: CartPoleSettings, timed: bool) -> Range:
         task: The task.
         timed: Whether the network counts on the time at which the episode ends.
     """
-    equal: dict[str, Any] = _body(task.system)
+    equal = body_values(task.system)
     equal |= {name: getattr(task, name) for name in ("control_period", "force_limit")}
     at_most = {name: getattr(task, name) for name in ("initial_angle", "goal_range")}
     (equal if timed else at_most)["time_limit"] = task.time_limit
@@ -49,31 +44,14 @@ def cartpole_range(task: CartPoleSettings, timed: bool) -> Range:
 
 def cartpole_design(system: CartPole) -> Range:
     """Return what a metric that was designed for a cart-pole may track."""
-    return {"equal": _body(system)}
-
-
-def spacecraft_range(task: SpacecraftSettings, presets: Iterable[str | Preset]) -> Range:
-    """Return what a network of the spacecraft that was trained for a task may fly.
-
-    It looks at what one agent senses, so that it is not tied to a number of agents or obstacles.
-
-    Args:
-        task: The task.
-        presets: Those whose bodies it has met.
-    """
-    names = ("control_period", "horizon", "sensing_radius", "thrust_limit")
-    return {
-        "equal": _body(task.system) | {name: getattr(task, name) for name in names},
-        "at_most": {"time_limit": task.time_limit},
-        "one_of": {"radii": [_radii(preset_named(preset)) for preset in presets]},
-    }
+    return {"equal": body_values(system)}
 
 
 def weights_record(task: str, policy: str, trained_for: Range) -> dict[str, str]:
     """Return the metadata of a weights file.
 
     Args:
-        task: "cartpole" or "spacecraft".
+        task: Name of the task.
         policy: Name of the policy that flies it.
         trained_for: What it may fly.
     """
@@ -84,9 +62,10 @@ def check_trained_for(
     metadata: Mapping[str, str],
     what: str,
     policy: str | None,
-    flown: CartPoleSettings | tuple[SpacecraftSettings, Preset],
+    flown: Described,
     assumed: Range,
     allow_other_settings: bool = False,
+    told: Mapping[str, Any] | None = None,
 ) -> None:
     """Check that a network flies as what it was trained, and within what it was trained for.
 
@@ -94,14 +73,15 @@ def check_trained_for(
         metadata: Of its weights.
         what: The weights, for the message.
         policy: Name of the policy that is to fly it; None for any.
-        flown: The task, with the preset of the spacecraft.
+        flown: The task.
         assumed: What it may fly if the metadata do not say.
         allow_other_settings: Do not look at the settings.
+        told: What else a range may speak about, by name.
 
     Raises:
         ValueError: It is another policy's, or the settings are others.
     """
-    task = "cartpole" if isinstance(flown, CartPoleSettings) else "spacecraft"
+    task = flown.name
     found = metadata.get(TASK, task), metadata.get(POLICY, policy)
     if found[0] != task or (policy is not None and found[1] != policy):
         raise ValueError(
@@ -110,7 +90,7 @@ def check_trained_for(
     check_flag("allow_other_settings", allow_other_settings)
     if allow_other_settings:
         return
-    for name, value in _flown(flown).items():
+    for name, value in (_settings(flown) | dict(told or {})).items():
         needed = _needed(range_of(metadata, what, assumed), name, value)
         if needed is not None:
             raise ValueError(
@@ -206,20 +186,12 @@ def _needed(trained_for: Range, name: str, value: Any) -> str | None:
     return None
 
 
-def _flown(flown: CartPoleSettings | tuple[SpacecraftSettings, Preset]) -> dict[str, Any]:
-    """Return all that a range may speak about."""
-    task, preset = (flown, None) if isinstance(flown, CartPoleSettings) else flown
+def _settings(task: Any) -> dict[str, Any]:
+    """Return the settings of a task, and those of its body."""
     values = {item.name: getattr(task, item.name) for item in fields(task)}
-    values |= _body(task.system)
-    if preset is not None:
-        values["radii"] = _radii(preset)
-    return values
+    return values | body_values(task.system)
 
 
-def _body(system: Any) -> dict[str, float]:
+def body_values(system: Any) -> dict[str, Any]:
+    """Return the parameters of a system as ranges name them."""
     return {f"system.{item.name}": getattr(system, item.name) for item in fields(system)}
-
-
-def _radii(preset: Preset) -> list[float]:
-    """Return the radii of an agent against others and against obstacles, and of an obstacle."""
-    return [preset.agent_radius, preset.core, preset.obstacle_radius]

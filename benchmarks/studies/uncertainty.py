@@ -38,7 +38,7 @@ from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.actor import PpoPolicy
 from lagros_policies.baselines import LqrPolicy
 from lagros_policies.contraction.feedback import preferred_deviation
-from lagros_policies.lagros import LagrosPolicy, SpacecraftLagrosPolicy
+from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.remarks.adaptive import (
     AdaptiveControl,
     cart_mass_regressor,
@@ -47,6 +47,7 @@ from lagros_policies.remarks.adaptive import (
 )
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
+from lagros_policies.tasks.spacecraft.network_policy import SpacecraftLagrosPolicy
 
 FloatArray = NDArray[np.float64]
 Seen = Callable[[FloatArray, FloatArray, int], None]

@@ -13,13 +13,17 @@ from lagros_envs.tasks.cartpole import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_envs.tasks.spacecraft.task import THRUSTERS, SpacecraftSettings
-from lagros_policies.lagros import LagrosPolicy, SpacecraftLagrosPolicy
-from lagros_policies.learned import LearnedPolicy, SpacecraftLearnedPolicy
+from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.learned import LearnedPolicy
 from lagros_policies.learning.deep_set import DeepSet
 from lagros_policies.learning.network_policy import PRETRAINED, NetworkPolicy
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.tasks.cartpole.features import cartpole_features
-from lagros_policies.tasks.spacecraft.network_policy import SpacecraftNetworkPolicy
+from lagros_policies.tasks.spacecraft.network_policy import (
+    SpacecraftLagrosPolicy,
+    SpacecraftLearnedPolicy,
+    SpacecraftNetworkPolicy,
+)
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]

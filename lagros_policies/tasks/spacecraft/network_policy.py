@@ -17,9 +17,14 @@ from lagros_policies.observed import as_numbers
 from lagros_policies.policy import PolicyState
 from lagros_policies.tasks.spacecraft.features import SpacecraftFeatures, spacecraft_features
 from lagros_policies.tasks.spacecraft.sensed import Sensed
-from lagros_policies.tasks.spacecraft.setup import task_and_preset
+from lagros_policies.tasks.spacecraft.setup import (
+    PUBLISHED,
+    radii_of,
+    spacecraft_range,
+    task_and_preset,
+)
 from lagros_policies.tasks.spacecraft.thrusters import allocate
-from lagros_policies.trained_for import PUBLISHED, check_trained_for, spacecraft_range
+from lagros_policies.trained_for import check_trained_for
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -71,9 +76,10 @@ class SpacecraftNetworkPolicy:
             self.network.metadata,
             str(path),
             self.recorded_as,
-            (self.settings, self.preset),
+            self.settings,
             spacecraft_range(task.SpacecraftSettings(), PUBLISHED),
             allow_other_settings,
+            radii_of(self.preset),
         )
         self._radii = self.preset.agent_radius, self.preset.core
 
@@ -109,3 +115,17 @@ class SpacecraftNetworkPolicy:
     def bare_forward(self, features: SpacecraftFeatures) -> Float32Array:
         """Evaluate the network alone, for timing."""
         return self.network(features)
+
+
+class SpacecraftLearnedPolicy(SpacecraftNetworkPolicy):
+    """Policy (a): o_l -> u_d of each spacecraft, learned on undisturbed plans."""
+
+    name = recorded_as = "learned"
+    weights_file = "spacecraft_learned.safetensors"
+
+
+class SpacecraftLagrosPolicy(SpacecraftNetworkPolicy):
+    """Policy (c): o_l -> u* of each spacecraft from what it senses alone."""
+
+    name = recorded_as = "lagros"
+    weights_file = "spacecraft_lagros.safetensors"

@@ -14,9 +14,9 @@ from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.policy import PolicyState
 from lagros_policies.tasks.spacecraft.sensed import Sensed
-from lagros_policies.tasks.spacecraft.setup import task_and_preset
+from lagros_policies.tasks.spacecraft.setup import radii_of, spacecraft_range, task_and_preset
 from lagros_policies.tasks.spacecraft.thrusters import allocate
-from lagros_policies.trained_for import check_trained_for, spacecraft_range
+from lagros_policies.trained_for import check_trained_for
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -201,9 +201,10 @@ class SpacecraftPpoPolicy:
             self.network.metadata,
             "the network" if isinstance(file, Mlp) else str(file),
             self.name,
-            (self.settings, chosen),
+            self.settings,
             spacecraft_range(task.SpacecraftSettings(), TRAINED_IN),
             allow_other_settings,
+            radii_of(chosen),
         )
 
     def predict(

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from lagros_envs.conventions import settings_of
 from lagros_envs.tasks.spacecraft.scenarios import Preset, preset_named
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_policies.trained_for import Range, body_values
 
 # Position and velocity in the state: plans lie in the plane, at a heading that rests.
 PLANE = [0, 1, 3, 4]
 # Two agents err independently, so that their distance errs sqrt(2) times as far.
 PAIR_SHARE = math.sqrt(2.0)
+# Presets whose bodies the shipped networks met in training or in what is published about them.
+PUBLISHED = ("paper", "released")
 
 
 def task_and_preset(
@@ -35,6 +40,28 @@ def task_and_preset(
         settings_of(SpacecraftSettings(), settings),
         preset_named(preset).for_agents(num_agents),
     )
+
+
+def spacecraft_range(task: SpacecraftSettings, presets: Iterable[str | Preset]) -> Range:
+    """Return what a network that was trained for a task may fly.
+
+    It looks at what one agent senses, so that it is not tied to a number of agents or obstacles.
+
+    Args:
+        task: The task.
+        presets: Those whose bodies it has met.
+    """
+    names = ("control_period", "horizon", "sensing_radius", "thrust_limit")
+    return {
+        "equal": body_values(task.system) | {name: getattr(task, name) for name in names},
+        "at_most": {"time_limit": task.time_limit},
+        "one_of": {"radii": [radii_of(preset_named(preset))["radii"] for preset in presets]},
+    }
+
+
+def radii_of(preset: Preset) -> Mapping[str, Any]:
+    """Return the radii of an agent against others and against obstacles, and of an obstacle."""
+    return {"radii": [preset.agent_radius, preset.core, preset.obstacle_radius]}
 
 
 def plan_force_limit(settings: SpacecraftSettings, disturbance_bound: float) -> float | None:

@@ -35,7 +35,8 @@ from lagros_policies.learning.train_deep_set import (
 from lagros_policies.tasks.spacecraft.expert import SpacecraftExpertSettings
 from lagros_policies.tasks.spacecraft.flights import FlightData, FlightSettings, fly_expert
 from lagros_policies.tasks.spacecraft.sensed import Sensed
-from lagros_policies.trained_for import PUBLISHED, spacecraft_range, weights_record
+from lagros_policies.tasks.spacecraft.setup import PUBLISHED, spacecraft_range
+from lagros_policies.trained_for import weights_record
 
 BOUNDS = (0.2, 0.4, 0.6, 0.8, 1.0)
 _RELABELLED = "relabelled"

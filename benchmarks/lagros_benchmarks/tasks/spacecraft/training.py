@@ -38,7 +38,8 @@ from lagros_policies.tasks.spacecraft.ppo import (
     thrust_of,
 )
 from lagros_policies.tasks.spacecraft.sensed import Sensed
-from lagros_policies.trained_for import spacecraft_range, weights_record
+from lagros_policies.tasks.spacecraft.setup import spacecraft_range
+from lagros_policies.trained_for import weights_record
 
 FloatArray = NDArray[np.float64]
 RATES = ("success", "strict_success", "paper_success", "collided")
