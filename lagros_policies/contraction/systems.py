@@ -1,9 +1,8 @@
 """Which systems the functions of this package are for: everything else is refused by name.
 
 Most take any control-affine `System`, with a metric of x only if the control does not move it
-(`check_unmoved`); one of x_d serves the others. What uses the equations of the cart-pole or of the
-spacecraft (proofs, corners of boxes, thrusters) is for these two alone, not for a class derived
-from one, whose equation may be another.
+(`check_unmoved`); one of x_d serves the others. What uses the equations of the cart-pole (proofs,
+corners of boxes) is for it alone, not for a class derived from it, whose equation may be another.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 from lagros_envs.checks import shown
 from lagros_envs.dynamics import System
 from lagros_envs.tasks.cartpole.physics import ANGLE, CartPole
-from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.contraction.basis import Basis, cosines
 from lagros_policies.contraction.metric import DualMetric, Metric
 from lagros_policies.contraction.regions import Region
@@ -64,15 +62,6 @@ def check_cartpole_metric(metric: Any, what: str) -> None:
             f"{type(metric.region).__name__}: {what} is for 1, cos(x[{ANGLE}]), ... at the state, "
             "on a Region"
         )
-
-
-def check_spacecraft(body: Any, what: str) -> None:
-    """Refuse whatever is not the spacecraft; arguments as of `check_cartpole`.
-
-    Raises:
-        TypeError: It is no `Spacecraft`, or of a class derived from it.
-    """
-    _check_class("body", body, Spacecraft, what)
 
 
 def check_sizes(system: System, **arrays: tuple[FloatArray, tuple[int, ...]]) -> None:

@@ -27,8 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_not_negative, check_positive, check_whole
-from lagros_envs.tasks.spacecraft.physics import Spacecraft
-from lagros_policies.contraction.systems import check_spacecraft
+from lagros_envs.tasks.spacecraft.physics import Spacecraft, check_spacecraft
 from lagros_policies.tasks.spacecraft.thrusters import held_thrust
 
 FloatArray = NDArray[np.float64]

@@ -492,11 +492,7 @@ GENERAL = {
         "contraction.theorems.feasibility_residual",
     ),
     *("contraction.theorems.contraction_distance", "remarks.adaptive.largest_gain"),
-    *(
-        "contraction.systems.check_cartpole",
-        "contraction.systems.check_spacecraft",
-        "contraction.systems.check_sizes",
-    ),
+    *("contraction.systems.check_cartpole", "contraction.systems.check_sizes"),
     *(
         "contraction.cvstem.design_on_region",
         "contraction.cvstem_program.check_asked",

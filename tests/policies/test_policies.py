@@ -137,7 +137,7 @@ print(*failed)
     [
         ("clarabel", {"tube-mpc", "centralized"}),
         ("piqp", {"tube-mpc", "centralized"}),
-        ("scipy", {"lqr", "tube-mpc", "centralized", "learned"}),
+        ("scipy", {"lqr", "tube-mpc", "centralized"}),
         ("safetensors", {"learned", "lagros", "ppo", "sac", "td3", "residual"}),
         ("torch", set()),
         ("cvxpy", set()),

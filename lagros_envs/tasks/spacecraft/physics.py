@@ -136,3 +136,20 @@ class SpacecraftByWrench:
     def derivative(self, state: Components, control: Components, functions: Any) -> Components:
         """Return dx/dt from the wrench [N, N, N m] in the body's axes."""
         return self.body.motion(state, control, functions)
+
+
+def check_spacecraft(body: Any, what: str) -> None:
+    """Refuse whatever is not the spacecraft, whose thrusters are elsewhere.
+
+    Args:
+        body: The spacecraft.
+        what: Who uses its structure, as the message names it.
+
+    Raises:
+        TypeError: It is no `Spacecraft`, or of a class derived from it.
+    """
+    if type(body) is not Spacecraft:
+        raise TypeError(
+            f"body={body!r} must be a Spacecraft: {what} uses the structure of its equations, "
+            "which no other class is known to have"
+        )

@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.tasks.spacecraft.physics import Spacecraft
+from lagros_envs.tasks.spacecraft.physics import Spacecraft, check_spacecraft
 from lagros_policies.contraction.certificate import Certificate, Stopwatch, TubeSizes
 from lagros_policies.contraction.double_integrator import (
     AxisMetric,
@@ -17,7 +17,6 @@ from lagros_policies.contraction.double_integrator import (
     state_tube,
 )
 from lagros_policies.contraction.statement import Statement, at_most
-from lagros_policies.contraction.systems import check_spacecraft
 from lagros_policies.contraction.tube import diverging_bound
 from lagros_policies.tasks.spacecraft.ellipsoid_axis import (
     design_axis_ellipsoid,

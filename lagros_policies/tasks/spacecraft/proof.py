@@ -21,10 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.tasks.spacecraft.physics import HEADING, VELOCITY_X, Spacecraft
+from lagros_envs.tasks.spacecraft.physics import HEADING, VELOCITY_X, Spacecraft, check_spacecraft
 from lagros_policies.contraction.double_integrator import AxisMetric
 from lagros_policies.contraction.statement import Statement, at_most
-from lagros_policies.contraction.systems import check_spacecraft
 
 FloatArray = NDArray[np.float64]
 

@@ -17,8 +17,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN, Spacecraft
-from lagros_policies.contraction.systems import check_spacecraft
+from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN, Spacecraft, check_spacecraft
 
 FloatArray = NDArray[np.float64]
 

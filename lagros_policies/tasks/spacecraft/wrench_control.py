@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_positive
-from lagros_envs.tasks.spacecraft.physics import Spacecraft
+from lagros_envs.tasks.spacecraft.physics import Spacecraft, check_spacecraft
 from lagros_policies.contraction.double_integrator import AxisMetric, design_axis, flow
-from lagros_policies.contraction.systems import check_spacecraft
 from lagros_policies.tasks.spacecraft.thrusters import held_thrust
 
 FloatArray = NDArray[np.float64]
