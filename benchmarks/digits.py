@@ -187,11 +187,18 @@ def _cartpole_episode(kind: str) -> Any:
 
 
 def _cartpole_worlds(kind: str) -> Any:
-    from lagros_envs.cartpole_vector import CartPoleVectorEnv
+    import gymnasium as gym
 
-    envs = CartPoleVectorEnv(
-        num_envs=3, disturbance=kind, compiled=False, autoreset_mode="disabled"
-    )
+    import lagros_envs  # noqa: F401
+
+    envs: Any = gym.make_vec(
+        "lagros/CartPole-v0",
+        num_envs=3,
+        vectorization_mode="vector_entry_point",
+        disturbance=kind,
+        compiled=False,
+        autoreset_mode="disabled",
+    ).unwrapped
     envs.reset(seed=[1, 2, 3])
     rng = np.random.default_rng(0)
     rows = []
@@ -234,9 +241,13 @@ def _spacecraft_alone() -> Any:
 
 
 def _cartpole_plans() -> Any:
-    from lagros_policies.planning.cartpole import CartPolePlanner
+    import gymnasium as gym
 
-    planner = CartPolePlanner()
+    import lagros_envs  # noqa: F401
+    import lagros_policies
+
+    made: Any = lagros_policies.make("tube-mpc", gym.make("lagros/CartPole-v0"))
+    planner = made.expert.planner
     plans = [
         planner.plan(np.array([0.0, angle, 0.0, 0.0]), np.array([goal, 0.0, 0.0, 0.0]))
         for angle, goal in ((0.5, 2.0), (-1.0, 4.5))
