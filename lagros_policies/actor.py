@@ -19,6 +19,7 @@ from lagros_envs.tasks.cartpole import task
 from lagros_envs.tasks.cartpole.physics import ANGLE, POSITION
 from lagros_policies.learning.networks import Mlp, read_safetensors, write_safetensors
 from lagros_policies.observed import cartpole_rows
+from lagros_policies.policy import BasePolicy
 from lagros_policies.trained_for import (
     KEYS,
     EpisodeRange,
@@ -162,7 +163,7 @@ class Actor:
             raise ValueError(f"{path} is damaged: {error}") from error
 
 
-class ActorPolicy:
+class ActorPolicy(BasePolicy):
     """An actor in the place of a controller.
 
     Args:
@@ -184,7 +185,6 @@ class ActorPolicy:
     weights_file = ""
     recorded_as: str | None = None
     restricted = True  # `policy.make` tells it whether other settings are allowed
-    observes: Literal["local", "global"] = "local"
 
     def __init__(
         self,

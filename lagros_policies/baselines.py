@@ -8,7 +8,7 @@ Both policies follow stable-baselines3's `PolicyPredictor` protocol. Observation
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,13 @@ from lagros_envs.dynamics import linearise_hold
 from lagros_envs.options import real_numbers
 from lagros_envs.tasks.cartpole import task
 from lagros_policies.observed import cartpole_rows
+from lagros_policies.policy import BasePolicy
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
-Observes = Literal["local", "global"]
 
 
-class LqrPolicy:
+class LqrPolicy(BasePolicy):
     """Linear-quadratic regulator about the upright goal: u = -K (x - x_f).
 
     K minimises the infinite sum of x'Qx + u'Ru for the exact linearisation, at the upright, of one
@@ -47,8 +47,6 @@ class LqrPolicy:
     Attributes:
         gain: K, shape (1, 4) [N per unit of the state].
     """
-
-    observes: Observes = "local"
 
     def __init__(
         self,
@@ -115,7 +113,7 @@ class LqrPolicy:
         return (error @ self._action_gain).astype(np.float32), state
 
 
-class RandomPolicy:
+class RandomPolicy(BasePolicy):
     """Actions uniform in [-1, 1], from the policy's own generator.
 
     `deterministic` changes nothing: the draws are reproducible through the seed.
@@ -127,8 +125,6 @@ class RandomPolicy:
     Raises:
         ValueError: The seed is no whole number, or negative.
     """
-
-    observes: Observes = "local"
 
     def __init__(self, settings: task.CartPoleSettings | None = None, seed: int = 0) -> None:
         """Seed the generator; see the class for the arguments."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 from collections.abc import Callable
-from typing import Any, Literal, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,11 @@ from lagros_policies.wrappers import bare_environment
 Float32Array = NDArray[np.float32]
 # What a planner remembers between calls; stateless policies keep None.
 PolicyState = Any
+Observes = Literal["local", "global"]
+
+_INTERFACE = "predict(observation, state=None, episode_start=None, deterministic=True)"
+# What an object may have beside `predict`.
+_OPTIONAL = ("name", "observes", "reseed", "counters", "bare_forward", "example_features")
 
 # Policies of the cart-pole, and of the spacecraft; each is imported when it is asked for, as torch,
 # solvers and learned weights are needed only then.
@@ -39,10 +45,10 @@ SPACECRAFT_NAMES = tuple(_SPACECRAFT)
 
 @runtime_checkable
 class Policy(Protocol):
-    """Stable-baselines3's `PolicyPredictor`, with a name and what it may observe."""
+    """What a policy of anybody's has: stable-baselines3's `PolicyPredictor`, a name, its input."""
 
     name: str
-    observes: Literal["local", "global"]
+    observes: Observes
 
     def predict(
         self,
@@ -62,6 +68,156 @@ class Policy(Protocol):
         Returns:
             The action (m,) or (B, m), float32 in the units of the environment, and the state.
         """
+
+
+class BasePolicy:
+    """All that is asked of a policy, answered as by one that has nothing but `predict`.
+
+    Attributes:
+        name: Name in tables.
+        observes: "local" for the rows that the environment returns; "global" for the `state()` of
+            a world of many agents.
+        prepared: Whether it is built with the bound of the disturbance, as `disturbance_bound`.
+        restricted: Whether it is told if other settings are allowed, as `allow_other_settings`.
+        planner: What it plans with; None where it does not plan.
+        tracking: The law by which it follows a plan, where its error has a certified bound.
+    """
+
+    name: str = "policy"
+    observes: Observes = "local"
+    prepared: ClassVar[bool] = False
+    restricted: ClassVar[bool] = False
+    planner: Any = None
+    tracking: Any = None
+
+    def predict(
+        self,
+        observation: Float32Array,
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, PolicyState]:
+        """Choose an action; see `Policy.predict`."""
+        raise NotImplementedError(f"{type(self).__name__} needs {_INTERFACE}")
+
+    def counters(self, state: PolicyState) -> dict[str, int]:
+        """Return what the policy has counted in its memory of an episode, or of several."""
+        return {}
+
+    def reseed(self, generator: np.random.Generator) -> None:
+        """Take the generator of an episode, from which the policy is to draw."""
+
+    @property
+    def draws(self) -> bool:
+        """Whether it takes a generator, so that episodes in one batch would share it."""
+        return type(self).reseed is not BasePolicy.reseed
+
+    @property
+    def bare(self) -> BasePolicy:
+        """The policy without the safety filter that it uses."""
+        return self
+
+    def example_features(self) -> Any:
+        """Return an input of the network, to time it alone; None for a policy that has none."""
+        return None
+
+    def bare_forward(self, features: Any) -> Any:
+        """Evaluate the network alone, for timing."""
+        raise NotImplementedError(f"{self.name} has no network to evaluate alone")
+
+
+class AdaptedPolicy(BasePolicy):
+    """An object with `predict`, and with whatever else of `BasePolicy` it has.
+
+    Args:
+        inner: The object.
+        name: Name in tables, if it has none itself.
+
+    Attributes:
+        inner: The object.
+    """
+
+    def __init__(self, inner: Any, name: str | None = None) -> None:
+        """Look at what the object has; what its properties raise is raised here."""
+        found = {part: getattr(inner, part, None) for part in _OPTIONAL}
+        self.inner = inner
+        self.name = str(found["name"] or name or type(inner).__name__)
+        self.observes = found["observes"] or "local"
+        self._has = frozenset(part for part, value in found.items() if callable(value))
+
+    def predict(
+        self,
+        observation: Float32Array,
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, PolicyState]:
+        """Ask the object; see `Policy.predict`."""
+        answer: tuple[Float32Array, PolicyState] = self.inner.predict(
+            observation, state, episode_start, deterministic
+        )
+        return answer
+
+    def counters(self, state: PolicyState) -> dict[str, int]:
+        """Return what the object counts."""
+        return self.inner.counters(state) if "counters" in self._has else {}
+
+    def reseed(self, generator: np.random.Generator) -> None:
+        """Pass the generator on, if the object takes one."""
+        if self.draws:
+            self.inner.reseed(generator)
+
+    @property
+    def draws(self) -> bool:
+        """Whether the object takes a generator."""
+        return "reseed" in self._has
+
+    def example_features(self) -> Any:
+        """Return an input of the object's network; None if it has none to be timed."""
+        timed = {"example_features", "bare_forward"} <= self._has
+        return self.inner.example_features() if timed else None
+
+    def bare_forward(self, features: Any) -> Any:
+        """Evaluate the object's network alone."""
+        return self.inner.bare_forward(features)
+
+
+def as_policy(given: Any, name: str | None = None) -> BasePolicy:
+    """Return an object as a policy of which everything can be asked.
+
+    Args:
+        given: A policy of this package, or any object with `predict`, such as a model of
+            stable-baselines3.
+        name: Name in tables, for an object that has none.
+
+    Returns:
+        The object itself if it is a `BasePolicy`.
+
+    Raises:
+        TypeError: It has no `predict` that can be called as it must be.
+        ValueError: It says wrongly what it observes.
+    """
+    what = f"policy {name!r}" if name else "the policy"
+    if inspect.isclass(given):
+        raise TypeError(f"{what} is the class {given.__name__}; it must be an object of it")
+    predict = getattr(given, "predict", None)
+    if not callable(predict):
+        raise TypeError(f"{what} cannot fly: a {type(given).__name__} has no method {_INTERFACE}")
+    try:
+        signature = inspect.signature(predict)
+    except (TypeError, ValueError):
+        pass  # written in C, it does not tell
+    else:
+        try:
+            signature.bind(None, None, None, True)
+        except TypeError as error:
+            raise TypeError(
+                f"{what} cannot fly: predict{signature} {error}; it must be {_INTERFACE}"
+            ) from None
+    policy = given if isinstance(given, BasePolicy) else AdaptedPolicy(given, name)
+    if policy.observes not in ("local", "global"):
+        raise ValueError(f'{what} has observes={policy.observes!r}; it must be "local" or "global"')
+    return policy
 
 
 Memory = TypeVar("Memory")
@@ -134,7 +290,7 @@ def make(
         settings: Passed to the policy, e.g. `weights=path` or `metric=...`.
 
     Returns:
-        The policy.
+        The policy. What a class of your own builds is returned as it is; see `as_policy`.
 
     Raises:
         ValueError: The name or the id is unknown, the settings or the preset are others than those

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from lagros_envs.conventions import settings_of
 from lagros_envs.tasks.cartpole import task
 from lagros_policies.actor import Actor, ActorPolicy
 from lagros_policies.lagros import LagrosPolicy
-from lagros_policies.policy import PolicyState
+from lagros_policies.policy import BasePolicy, PolicyState
 
 Float32Array = NDArray[np.float32]
 
@@ -25,7 +25,7 @@ class Correction(ActorPolicy):
     weights_file = "cartpole_residual.safetensors"
 
 
-class ResidualPolicy:
+class ResidualPolicy(BasePolicy):
     """The force of LAG-ROS plus a correction that reinforcement learning has trained.
 
     A correction of at most beta enters Theorem 1 as a learning error does: where its bound holds
@@ -49,7 +49,6 @@ class ResidualPolicy:
 
     name = "residual"
     restricted = True  # `policy.make` tells it whether other settings are allowed
-    observes: Literal["local", "global"] = "local"
 
     def __init__(
         self,

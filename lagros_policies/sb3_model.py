@@ -6,7 +6,7 @@ import importlib
 import io
 import zipfile
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from lagros_envs.tasks.spacecraft.scenarios import Preset, preset_named
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.naming import ALGORITHMS
 from lagros_policies.observed import as_numbers
+from lagros_policies.policy import BasePolicy
 
 Float32Array = NDArray[np.float32]
 
@@ -27,7 +28,7 @@ MOST_EXPANDED = 1 << 28
 MOST_ENTRIES = 100
 
 
-class StableBaselines3Policy:
+class StableBaselines3Policy(BasePolicy):
     """A stable-baselines3 model with the interface and the checks of this package.
 
     Args:
@@ -41,8 +42,6 @@ class StableBaselines3Policy:
         ValueError: The model was trained on other spaces or within other bounds of the action, or
             there is no such preset.
     """
-
-    observes: Literal["local", "global"] = "local"
 
     def __init__(self, model: Any, name: str, preset: str | Preset | None = None) -> None:
         """Wrap the model; see the class for the arguments."""

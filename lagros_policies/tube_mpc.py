@@ -7,7 +7,6 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction import ContractionMetric, load_metric
 from lagros_policies.observed import cartpole_rows
 from lagros_policies.planning import Trajectory
-from lagros_policies.policy import PolicyState, row_memories
+from lagros_policies.policy import BasePolicy, PolicyState, row_memories
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert, TrackedPlans
 from lagros_policies.tasks.cartpole.planner import FORCE_SLACK
 from lagros_policies.trained_for import cartpole_design, check_trained_for
@@ -57,7 +56,7 @@ class TubeMpcState:
     saturated_steps: int = 0
 
 
-class TubeMpcPolicy:
+class TubeMpcPolicy(BasePolicy):
     """Online tube MPC with the CV-STEM control u* around the plan.
 
     The plan is renewed from the *nominal* state x_d(t), not from the measured one: the tube of
@@ -82,7 +81,6 @@ class TubeMpcPolicy:
 
     name = "tube-mpc"
     restricted = True  # `policy.make` tells it whether other settings are allowed
-    observes: Literal["local", "global"] = "local"
 
     def __init__(
         self,

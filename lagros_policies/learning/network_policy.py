@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from lagros_envs.conventions import settings_of
 from lagros_envs.tasks.cartpole import task
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.observed import cartpole_rows
-from lagros_policies.policy import PolicyState
+from lagros_policies.policy import BasePolicy, PolicyState
 from lagros_policies.tasks.cartpole.features import FEATURES, cartpole_features
 from lagros_policies.trained_for import (
     EpisodeRange,
@@ -27,7 +26,7 @@ _WAY, _LEAN = FEATURES.index("goal - start [m]"), FEATURES.index("initial angle 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 
 
-class NetworkPolicy:
+class NetworkPolicy(BasePolicy):
     """Maps (x, o_l, t) to a force by one evaluation of a network, without torch.
 
     Args:
@@ -48,7 +47,6 @@ class NetworkPolicy:
     weights_file: str
     recorded_as: str | None = None
     restricted = True  # `policy.make` tells it whether other settings are allowed
-    observes: Literal["local", "global"] = "local"
 
     def __init__(
         self,

@@ -10,7 +10,7 @@ for bit. Nothing is silent: what the filter does is counted.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN, VELOCITY_X
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import OBSTACLE_DIM, Layout
 from lagros_policies.observed import as_numbers
-from lagros_policies.policy import Policy, PolicyState
+from lagros_policies.policy import BasePolicy, Policy, PolicyState, as_policy
 from lagros_policies.safety.barrier import BarrierSettings, BrakingBarrier, HalfPlanes
 from lagros_policies.safety.half_planes import nearest
 from lagros_policies.tasks.spacecraft.sensed import Sensed, WorldState
@@ -57,7 +57,7 @@ class FilterState(NamedTuple):
     counts: IntArray
 
 
-class SafetyFilter:
+class SafetyFilter(BasePolicy):
     """A policy whose actions keep clear of what is sensed.
 
     It uses what lies within the sensing radius and the radii of the preset, also for an inner
@@ -77,8 +77,6 @@ class SafetyFilter:
         ValueError: A value is out of range, or a rate is too fast for the control period.
     """
 
-    observes: Literal["local", "global"]
-
     def __init__(
         self,
         policy: Policy,
@@ -89,16 +87,9 @@ class SafetyFilter:
         barrier: BarrierSettings | None = None,
     ) -> None:
         """Build the barrier."""
-        if not isinstance(policy, Policy):
-            raise TypeError(
-                f"the inner policy is a {type(policy).__name__}; it needs name, observes and "
-                "predict, as lagros_policies.make builds it"
-            )
-        if policy.observes not in ("local", "global"):
-            raise ValueError(f'observes={policy.observes!r} must be "local" or "global"')
-        self.policy = policy
-        self.name = f"{policy.name}+filter"
-        self.observes = policy.observes
+        self.policy = as_policy(policy)
+        self.name = f"{self.policy.name}+filter"
+        self.observes = self.policy.observes
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
         chosen = BarrierSettings.for_bound(disturbance_bound) if barrier is None else barrier
@@ -160,18 +151,22 @@ class SafetyFilter:
         and `infeasible` those at which not everything could be kept clear of, so that the largest
         violation was made least.
         """
-        inner = getattr(self.policy, "counters", None)
         totals = state.counts.sum(axis=0).tolist()
-        return {
-            **({} if inner is None else inner(state.inner)),
-            **dict(zip(COUNTERS, totals, strict=True)),
-        }
+        return {**self.policy.counters(state.inner), **dict(zip(COUNTERS, totals, strict=True))}
 
     def reseed(self, generator: np.random.Generator) -> None:
         """Pass the generator on, if the inner policy draws anything."""
-        inner = getattr(self.policy, "reseed", None)
-        if inner is not None:
-            inner(generator)
+        self.policy.reseed(generator)
+
+    @property
+    def draws(self) -> bool:
+        """Whether the inner policy takes a generator."""
+        return self.policy.draws
+
+    @property
+    def bare(self) -> BasePolicy:
+        """The inner policy."""
+        return self.policy
 
     def filter(
         self, actions: NDArray[Any], sensed: Sensed

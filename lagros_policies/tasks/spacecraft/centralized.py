@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_policies.contraction.double_integrator import planned_margin
 from lagros_policies.planning.joint.plan import JointPlan
-from lagros_policies.policy import PolicyState, row_memories
+from lagros_policies.policy import BasePolicy, Observes, PolicyState, row_memories
 from lagros_policies.tasks.spacecraft.joint_planner import (
     SpacecraftPlanner,
     SpacecraftPlannerSettings,
@@ -101,7 +100,7 @@ class CentralizedState:
         return self.plan is not None and self.plan.solved
 
 
-class CentralizedPolicy:
+class CentralizedPolicy(BasePolicy):
     """Joint trajectories of all agents, planned once, with the control u* around them.
 
     It is fed the environment's `state()`. At the start of an episode it plans for all agents from
@@ -132,7 +131,7 @@ class CentralizedPolicy:
 
     name = "centralized"
     prepared = True  # `policy.make` tells it the bound of the environment's disturbance
-    observes: Literal["local", "global"] = "global"
+    observes: Observes = "global"
 
     def __init__(
         self,

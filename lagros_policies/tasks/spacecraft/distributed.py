@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from lagros_policies.planning.local.map import LocalMap
 from lagros_policies.planning.local.motion import Discs, LocalPlan
 from lagros_policies.planning.local.plan import LocalPlanner
 from lagros_policies.planning.local.problem import LocalPlannerSettings
-from lagros_policies.policy import PolicyState, row_memories
+from lagros_policies.policy import BasePolicy, PolicyState, row_memories
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.setup import (
     PAIR_SHARE,
@@ -82,7 +81,7 @@ class DistributedState:
         return self.infeasible_plans + self.broken_plans
 
 
-class DistributedTubeMpcPolicy:
+class DistributedTubeMpcPolicy(BasePolicy):
     """Distributed online tube MPC with the control u* around each agent's own plan.
 
     Every row of an observation is one agent, which knows what it senses and remembers the obstacles
@@ -118,7 +117,6 @@ class DistributedTubeMpcPolicy:
 
     name = "tube-mpc"
     prepared = True  # `policy.make` tells it the bound of the environment's disturbance
-    observes: Literal["local", "global"] = "local"
 
     def __init__(
         self,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.learning.deep_set import DeepSet
 from lagros_policies.learning.network_policy import PRETRAINED
 from lagros_policies.observed import as_numbers
-from lagros_policies.policy import PolicyState
+from lagros_policies.policy import BasePolicy, PolicyState
 from lagros_policies.tasks.spacecraft.features import SpacecraftFeatures, spacecraft_features
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.setup import (
@@ -30,7 +29,7 @@ Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
 
-class SpacecraftNetworkPolicy:
+class SpacecraftNetworkPolicy(BasePolicy):
     """Maps what an agent senses to its eight thrusters by one evaluation of a network.
 
     The network answers with an acceleration in the frame of the goal; a turn into the body's axes
@@ -57,7 +56,6 @@ class SpacecraftNetworkPolicy:
     weights_file: str
     recorded_as: str | None = None
     restricted = True  # `policy.make` tells it whether other settings are allowed
-    observes: Literal["local", "global"] = "local"
 
     def __init__(
         self,

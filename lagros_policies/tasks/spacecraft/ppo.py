@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.learning.networks import Mlp
-from lagros_policies.policy import PolicyState
+from lagros_policies.policy import BasePolicy, PolicyState
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.setup import radii_of, spacecraft_range, task_and_preset
 from lagros_policies.tasks.spacecraft.thrusters import allocate
@@ -158,7 +158,7 @@ def thrust_of(
     return (allocate(settings.system, wrench) / settings.thrust_scale).astype(np.float32)
 
 
-class SpacecraftPpoPolicy:
+class SpacecraftPpoPolicy(BasePolicy):
     """The trained actor, its mean action, for any number of agents.
 
     `lagros train spacecraft --algo ppo` trains it, with six agents in the preset `paper`.
@@ -177,7 +177,6 @@ class SpacecraftPpoPolicy:
 
     name = "ppo"
     restricted = True  # `policy.make` tells it whether other settings are allowed
-    observes: Literal["local", "global"] = "local"
 
     def __init__(
         self,
