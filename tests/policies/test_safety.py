@@ -12,7 +12,7 @@ from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Scenario
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
-from lagros_policies.policy import Policy
+from lagros_policies.policy import BasePolicy, Policy
 from lagros_policies.safety.barrier import BarrierSettings, BrakingBarrier
 from lagros_policies.safety.filter import FilterState, SafetyFilter
 from lagros_policies.tasks.spacecraft.sensed import Sensed
@@ -23,7 +23,7 @@ PERIOD = 0.1
 BODY = Spacecraft()
 
 
-class Thrust:
+class Thrust(BasePolicy):
     """Answers with the same thrust always, and notes what it is asked."""
 
     name = "thrust"
@@ -414,7 +414,7 @@ def test_what_lies_beyond_the_sensing_radius_changes_nothing():
 
 
 def test_errors_name_what_is_wrong():
-    with pytest.raises(TypeError, match="name, observes and predict"):
+    with pytest.raises(TypeError, match=r"a object has no method predict\(observation"):
         SafetyFilter(object())
     with pytest.raises(ValueError, match=r'observes=.* must be "local" or "global"'):
         SafetyFilter(Thrust(None, "nothing"))

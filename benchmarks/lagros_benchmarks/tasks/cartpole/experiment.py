@@ -15,7 +15,6 @@ from lagros_benchmarks.run.episodes import ACTION, EpisodeRecord, run_episode
 from lagros_benchmarks.run.experiment import BenchmarkRun
 from lagros_benchmarks.run.flying import rehearse
 from lagros_benchmarks.run.library import (
-    BareNetwork,
     Environment,
     FloatArray,
     Policy,
@@ -204,9 +203,12 @@ def plan_nominals(
 
 def forward_time(policy: Policy) -> float | None:
     """Return the median time of the policy's bare network on one input [s], or None."""
-    if not isinstance(policy, BareNetwork):
+    from lagros_policies.policy import as_policy
+
+    asked = as_policy(policy)
+    forward, features = asked.bare_forward, asked.example_features()
+    if features is None:
         return None
-    forward, features = policy.bare_forward, policy.example_features()
     times = np.empty(_FORWARD_CALLS)
     for call in range(_FORWARD_CALLS):
         begin = perf_counter()

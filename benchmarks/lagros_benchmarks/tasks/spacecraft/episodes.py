@@ -234,8 +234,10 @@ def fly_chunk(
     Returns:
         The records, in the order of the seeds, and the counters.
     """
+    from lagros_policies.policy import as_policy
+
     # What a policy draws comes from the stream of one episode.
-    alone = len(seeds) == 1 or getattr(bare(policy), "reseed", None) is not None
+    alone = len(seeds) == 1 or as_policy(bare(policy)).draws
     if not alone:
         flight = fly(make_env(len(seeds)), policy, seeds, margin)
         if all(world.error is None for world in flight.worlds):
