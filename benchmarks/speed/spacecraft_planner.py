@@ -12,7 +12,7 @@ import argparse
 import numpy as np
 
 from lagros_envs.tasks.spacecraft.scenarios import PRESETS
-from lagros_policies.tasks.spacecraft.joint_planner import SpacecraftPlanner
+from lagros_policies.planning.joint.planner import JointPlanner
 
 
 def main() -> None:
@@ -23,7 +23,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--agents", type=int)
     options = parser.parse_args()
-    planner = SpacecraftPlanner()
+    planner = JointPlanner()
     rows = []
     for world in range(options.worlds):
         rng = np.random.default_rng([options.seed, world])

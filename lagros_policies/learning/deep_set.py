@@ -10,27 +10,52 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import shown
 from lagros_policies.learning.networks import read_safetensors, write_safetensors
-from lagros_policies.tasks.spacecraft.features import (
-    NEIGHBOUR,
-    OBSTACLE,
-    OWN,
-    SpacecraftFeatures,
-)
 
 Float32Array = NDArray[np.float32]
 Layers = Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
 
-OUTPUTS = 3  # acceleration in the frame of the goal, and of the heading
 _FORMAT = "lagros-deep-set-1"
 # Up to this many entries a matrix of weights adds up faster than a walk over the owners.
 _DENSE = 4096
 _PARTS = ("neighbour", "obstacle", "agent")
+
+
+class Elements(NamedTuple):
+    """The bodies of one kind that B agents sense, e in all.
+
+    Attributes:
+        values: One row for each, shape (e, f).
+        owner: Who senses it, ascending, shape (e,).
+        weight: From 0 at the rim of what is sensed to 1, shape (e,).
+    """
+
+    values: Float32Array
+    owner: NDArray[np.intp]
+    weight: Float32Array
+
+
+class SetFeatures(NamedTuple):
+    """Inputs of a deep set for B agents.
+
+    Attributes:
+        own: What each knows of itself, shape (B, f).
+        neighbours: The other agents that it senses.
+        obstacles: The obstacles that it senses.
+        frame: Unit vectors as complex numbers, shape (B,); a vector of the world is one of the
+            network's times this.
+    """
+
+    own: Float32Array
+    neighbours: Elements
+    obstacles: Elements
+    frame: NDArray[np.complex128]
 
 
 class DeepSet:
@@ -47,6 +72,10 @@ class DeepSet:
 
     Raises:
         ValueError: The shapes do not chain, or a number is not finite.
+
+    Attributes:
+        inputs: How many features an agent has of itself, of a neighbour and of an obstacle.
+        outputs: How many numbers it answers.
     """
 
     def __init__(
@@ -63,23 +92,28 @@ class DeepSet:
             name: [(_float32(weight), _float32(bias)) for weight, bias in layers]
             for name, layers in parts.items()
         }
-        first = _check("neighbour", self.layers["neighbour"], len(NEIGHBOUR))
-        second = _check("obstacle", self.layers["obstacle"], len(OBSTACLE))
-        last = _check("agent", self.layers["agent"], len(OWN) + first + second)
-        if last != OUTPUTS:
-            raise ValueError(f"the network has {last} outputs; it must have {OUTPUTS}")
-        self._widths = (first, second)
+        (near, first), (still, second), (whole, self.outputs) = (
+            _check(name, layers) for name, layers in self.layers.items()
+        )
+        own = whole - first - second
+        if own < 1:
+            raise ValueError(
+                f"layer 0 of agent has {whole} inputs, of which {first} and {second} are sums: an "
+                "agent knows nothing of itself"
+            )
+        self.inputs = own, near, still
+        self._widths = first, second
 
-    def __call__(self, features: SpacecraftFeatures) -> Float32Array:
+    def __call__(self, features: SetFeatures) -> Float32Array:
         """Evaluate the network for B agents.
 
         Args:
             features: Of the agents.
 
         Returns:
-            Accelerations towards the goal, across, and of the heading, shape (B, 3).
+            The answers, shape (B, outputs).
         """
-        count, own = len(features.own), len(OWN)
+        count, own = len(features.own), self.inputs[0]
         first, second = self._widths
         inputs = np.zeros((count, own + first + second), np.float32)
         inputs[:, :own] = features.own
@@ -177,14 +211,15 @@ def _float32(values: NDArray[np.floating]) -> Float32Array:
     return np.array(values, np.float32, order="C")
 
 
-def _check(name: str, layers: Layers, width: int) -> int:
-    """Return the width after the layers of one part.
+def _check(name: str, layers: Layers) -> tuple[int, int]:
+    """Return the widths before and after the layers of one part.
 
     Raises:
         ValueError: The shapes do not chain, or a number is not finite.
     """
     if not layers:
         raise ValueError(f"the part {name!r} has no layers")
+    inputs = width = len(layers[0][0])
     for index, (weight, bias) in enumerate(layers):
         if weight.ndim != 2 or weight.shape[0] != width or bias.shape != weight.shape[1:]:
             raise ValueError(
@@ -194,4 +229,4 @@ def _check(name: str, layers: Layers, width: int) -> int:
         if not (np.all(np.isfinite(weight)) and np.all(np.isfinite(bias))):
             raise ValueError(f"layer {index} of {name} holds numbers that are not finite")
         width = weight.shape[1]
-    return width
+    return inputs, width

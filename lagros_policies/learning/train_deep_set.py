@@ -13,19 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_each, check_fields, check_positive, check_seed, check_whole
-from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
-from lagros_policies.learning.deep_set import OUTPUTS, DeepSet
+from lagros_policies.learning.deep_set import DeepSet, Elements, SetFeatures
 from lagros_policies.learning.fitting import Fit, IntArray, one_thread
-from lagros_policies.tasks.spacecraft.features import (
-    NEIGHBOUR,
-    OBSTACLE,
-    OWN,
-    Elements,
-    SpacecraftFeatures,
-    spacecraft_features,
-)
-from lagros_policies.tasks.spacecraft.flights import FlightData
-from lagros_policies.tasks.spacecraft.sensed import Sensed
 
 if TYPE_CHECKING:
     import torch
@@ -81,11 +70,11 @@ class SetSamples:
 
     Attributes:
         features: Inputs of s samples.
-        target: Labels in the frame of the goal, shape (s, 3).
+        target: Accelerations in the frame of the features, and of the heading, shape (s, 3).
         world: Which world each sample belongs to, shape (s,).
     """
 
-    features: SpacecraftFeatures
+    features: SetFeatures
     target: Float32Array
     world: IntArray
 
@@ -94,32 +83,13 @@ class SetSamples:
         return len(self.target)
 
 
-def flight_samples(
-    data: FlightData, task: SpacecraftSettings, agent_radius: float, core_radius: float
-) -> SetSamples:
-    """Return features and labels of flights.
-
-    Args:
-        data: The flights.
-        task: Their task.
-        agent_radius: Radius of every agent against the others [m].
-        core_radius: Radius against obstacles [m].
-    """
-    sensed = Sensed.of(data.layout, data.observation)
-    features = spacecraft_features(sensed, task, agent_radius, core_radius)
-    plane = data.acceleration[:, 0] + 1j * data.acceleration[:, 1]
-    plane *= features.frame.conj()
-    target = np.stack([plane.real, plane.imag, data.acceleration[:, 2]], axis=-1)
-    return SetSamples(features, target.astype(np.float32), data.world)
-
-
 def join(parts: Sequence[SetSamples]) -> SetSamples:
     """Return all samples in one; worlds of different parts stay different."""
     offsets = np.cumsum([0] + [len(part) for part in parts])
     worlds = np.cumsum([0] + [int(part.world.max(initial=-1)) + 1 for part in parts])
     features = [part.features for part in parts]
     return SetSamples(
-        SpacecraftFeatures(
+        SetFeatures(
             np.concatenate([one.own for one in features]),
             _join_elements([one.neighbours for one in features], offsets),
             _join_elements([one.obstacles for one in features], offsets),
@@ -204,9 +174,9 @@ class _Run(Fit[DeepSetTraining]):
         torch.manual_seed(settings.seed)
         wide = settings.element[-1]
         self.parts = [
-            _layers([len(NEIGHBOUR), *settings.element]),
-            _layers([len(OBSTACLE), *settings.element]),
-            _layers([len(OWN) + 2 * wide, *settings.agent, OUTPUTS])[:-1],
+            _layers([neighbours.shape[1], *settings.element]),
+            _layers([obstacles.shape[1], *settings.element]),
+            _layers([own.shape[1] + 2 * wide, *settings.agent, self.target.shape[1]])[:-1],
         ]
         data = hashlib.sha256()
         for array in (own, neighbours, obstacles, self.target):
@@ -244,13 +214,9 @@ class _Run(Fit[DeepSetTraining]):
         for module in self.parts:
             state = [value.detach().numpy().astype(np.float64) for value in module.parameters()]
             parts.append([(w.T, b) for w, b in zip(state[0::2], state[1::2], strict=True)])
-        for part, (mean, deviation), width in zip(
-            (parts[2], parts[0], parts[1]),
-            self.scales,
-            (len(OWN), len(NEIGHBOUR), len(OBSTACLE)),
-            strict=True,
-        ):
-            first = part[0][0].copy()
+        scaled = zip((parts[2], parts[0], parts[1]), self.scales, strict=True)
+        for part, (mean, deviation) in scaled:
+            first, width = part[0][0].copy(), len(mean)
             first[:width] /= deviation[:, None]
             part[0] = first, part[0][1] - mean @ first[:width]
         weight, bias = parts[2][-1]

@@ -10,9 +10,9 @@ from lagros_envs import spacecraft_v0
 from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Scenario
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.contraction.double_integrator import expected_margin
+from lagros_policies.planning.joint.planner import JointPlannerSettings
 from lagros_policies.policy import Policy
 from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
-from lagros_policies.tasks.spacecraft.joint_planner import SpacecraftPlannerSettings
 from lagros_policies.tasks.spacecraft.thrusters import allocate
 
 GOALS_AT = 1 + 6  # of one agent: time, state, goal
@@ -262,7 +262,7 @@ def test_the_margin_follows_the_bound_and_the_rate():
     planner = CentralizedPolicy(disturbance_bound=0.8).planner.settings
     assert planner.pair_share == pytest.approx(np.sqrt(2.0))
     assert list(planner.margins) == sorted(planner.margins, reverse=True)
-    own = SpacecraftPlannerSettings(margins=(0.2,))
+    own = JointPlannerSettings(margins=(0.2,))
     assert CentralizedPolicy(planner=own).planner.settings is own
 
 
@@ -274,9 +274,9 @@ def test_the_margin_follows_the_bound_and_the_rate():
         ({"contraction_rate": 0.0}, "contraction_rate=0.0"),
         ({"turning_rate": -1.0}, "turning_rate=-1.0"),
         ({"margin": -1.0}, "margin=-1.0"),
-        ({"margin": 0.1, "planner": SpacecraftPlannerSettings()}, "not both"),
-        ({"planner": SpacecraftPlannerSettings(mass=2.0)}, "mass=2.0"),
-        ({"planner": SpacecraftPlannerSettings(control_period=0.05)}, "control_period=0.05"),
+        ({"margin": 0.1, "planner": JointPlannerSettings()}, "not both"),
+        ({"planner": JointPlannerSettings(mass=2.0)}, "mass=2.0"),
+        ({"planner": JointPlannerSettings(control_period=0.05)}, "control_period=0.05"),
         ({"settings": SpacecraftSettings(horizon=20.2)}, "horizon=20.2"),
         ({"preset": "papers"}, "papers"),
         ({"num_agents": 0}, "num_agents=0"),

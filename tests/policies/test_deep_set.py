@@ -190,10 +190,10 @@ def test_damaged_and_foreign_files_are_refused(weights, tmp_path):
 def test_layers_that_do_not_chain_are_refused():
     rng = np.random.default_rng(0)
     good = random_layers(rng, len(NEIGHBOUR), 5), random_layers(rng, len(OBSTACLE), 4)
-    with pytest.raises(ValueError, match="agent"):
-        DeepSet(*good, random_layers(rng, len(OWN) + 8, 3))
-    with pytest.raises(ValueError, match="2 outputs"):
-        DeepSet(*good, random_layers(rng, len(OWN) + 9, 2))
+    with pytest.raises(ValueError, match="agent knows nothing"):
+        DeepSet(*good, random_layers(rng, 9, 3))
+    with pytest.raises(ValueError, match="layer 1 of agent"):
+        DeepSet(*good, [*random_layers(rng, 19, 4), *random_layers(rng, 5, 2)])
     with pytest.raises(ValueError, match="not finite"):
         DeepSet(*good, [(np.full((len(OWN) + 9, 3), np.nan), np.zeros(3))])
 
@@ -229,3 +229,15 @@ def test_to_be_late_is_to_have_left_later(weights, scene):
     assert not np.allclose(early, on_time, rtol=0.0, atol=1e-2)
     near[:, goal], near[:, time] = (0.1, 0.0), [[28.0], [44.0]]
     np.testing.assert_allclose(*policy.predict(near)[0], rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize(("own", "outputs"), [(len(OWN) - 1, 3), (len(OWN), 2)])
+def test_a_network_of_other_features_or_answers_is_refused(tmp_path, own, outputs):
+    rng = np.random.default_rng(0)
+    parts = random_layers(rng, len(NEIGHBOUR), 5), random_layers(rng, len(OBSTACLE), 4)
+    network = DeepSet(*parts, random_layers(rng, own + 9, outputs))
+    assert (network.inputs, network.outputs) == ((own, 7, 8), outputs)
+    path = tmp_path / "other.safetensors"
+    network.save(path)
+    with pytest.raises(ValueError, match=rf"other\.safetensors maps .* to {outputs} numbers"):
+        SpacecraftNetworkPolicy(weights=path)

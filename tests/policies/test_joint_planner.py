@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 
+from lagros_envs.dynamics import hold_step
 from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.planning.joint import grid_path
 from lagros_policies.planning.joint import scp as joint_scp
@@ -19,13 +20,15 @@ from lagros_policies.planning.joint.grid_path import (
     straighten,
     walk,
 )
-from lagros_policies.planning.joint.plan import fly, swept_distances
+from lagros_policies.planning.joint.plan import swept_distances
+from lagros_policies.planning.joint.planner import (
+    JointPlanner,
+    JointPlannerSettings,
+)
 from lagros_policies.planning.joint.problem import JointScpSettings
 from lagros_policies.planning.qp import QpSolution
-from lagros_policies.tasks.spacecraft.joint_planner import (
-    SpacecraftPlanner,
-    SpacecraftPlannerSettings,
-)
+from lagros_policies.tasks.spacecraft.setup import write_plan
+from lagros_policies.tasks.spacecraft.thrusters import thrust_for_acceleration
 
 OBSTACLE, AGENT = 0.5, 0.25
 NONE = np.empty((0, 2))
@@ -95,7 +98,7 @@ def check(plan, starts, goals, obstacles, settings):
 
 
 def count_solved(seeds):
-    planner = SpacecraftPlanner()
+    planner = JointPlanner()
     solved = 0
     for seed in seeds:
         starts, goals, obstacles = scenario(seed)
@@ -120,7 +123,7 @@ def test_at_least_98_percent_of_random_scenarios_are_solved():
 @pytest.fixture(scope="module")
 def crowded():
     starts, goals, obstacles = scenario(3)
-    plan = SpacecraftPlanner().plan(starts, goals, obstacles, OBSTACLE, AGENT)
+    plan = JointPlanner().plan(starts, goals, obstacles, OBSTACLE, AGENT)
     assert plan.solved
     return starts, goals, obstacles, plan
 
@@ -128,13 +131,21 @@ def crowded():
 def test_eight_thrusters_fly_the_plan_at_any_heading(crowded):
     *_, plan = crowded
     headings = np.linspace(-3.0, 3.0, 6)
-    states, thrust = fly(plan, Spacecraft(), 0.1, headings)
-    reference, _ = plan.reference(0.1, headings)
+    reference, accelerations = np.full((306, 6, 6), np.nan), np.full((305, 6, 3), np.nan)
+    assert write_plan(plan, 2, headings, 0.1, reference, accelerations) == 302
+    body = Spacecraft()
+    thrust = thrust_for_acceleration(body, reference[2:-1], accelerations[2:])
+    state, states = reference[2], [reference[2]]
+    for held in thrust:
+        state = hold_step(body, state, held, 0.1)
+        states.append(state)
     assert np.all(thrust >= 0.0)
+    assert np.isnan(reference[:2]).all()
+    assert np.isnan(accelerations[:2]).all()
     # The quadratic programs keep their equalities to 1e-6 per node step.
-    assert np.max(np.abs(states - reference)) < 1e-3
-    assert states[..., 2] == pytest.approx(np.tile(headings[:, None], 301), abs=1e-9)
-    effort = 0.1 * np.sum(thrust**2, axis=(1, 2))
+    assert np.max(np.abs(np.array(states) - reference[2:])) < 1e-3
+    assert np.array(states)[..., 2] == pytest.approx(np.tile(headings, (304, 1)), abs=1e-9)
+    effort = 0.1 * np.sum(thrust**2, axis=(0, 2))
     assert effort == pytest.approx(plan.effort, rel=1e-9)
 
 
@@ -153,12 +164,12 @@ def test_resampling_is_the_same_motion(crowded):
 
 def test_a_plan_is_the_same_every_time(crowded):
     starts, goals, obstacles, plan = crowded
-    again = SpacecraftPlanner().plan(starts, goals, obstacles, OBSTACLE, AGENT)
+    again = JointPlanner().plan(starts, goals, obstacles, OBSTACLE, AGENT)
     assert np.array_equal(plan.states, again.states)
     code = (
         "import numpy as np\n"
-        "from lagros_policies.tasks.spacecraft.joint_planner import SpacecraftPlanner\n"
-        f"p = SpacecraftPlanner().plan(np.array({starts.tolist()}), np.array({goals.tolist()}),"
+        "from lagros_policies.planning.joint.planner import JointPlanner\n"
+        f"p = JointPlanner().plan(np.array({starts.tolist()}), np.array({goals.tolist()}),"
         f" np.array({obstacles.tolist()}), {OBSTACLE}, {AGENT})\n"
         "print(p.states.tobytes().hex()[:4000])"
     )
@@ -168,7 +179,7 @@ def test_a_plan_is_the_same_every_time(crowded):
 
 def test_alone_in_the_open_the_plan_is_the_least_norm_one():
     start, goal = np.array([[0.3, 0.4]]), np.array([[4.0, 2.0]])
-    plan = SpacecraftPlanner().plan(start, goal, NONE, OBSTACLE, AGENT)
+    plan = JointPlanner().plan(start, goal, NONE, OBSTACLE, AGENT)
     assert plan.solved
     assert plan.clearance == np.inf
     left = 0.5 * np.arange(59, -1, -1)
@@ -181,9 +192,9 @@ def test_alone_in_the_open_the_plan_is_the_least_norm_one():
 def test_around_one_obstacle_no_optimiser_does_better():
     from scipy.optimize import minimize
 
-    settings = SpacecraftPlannerSettings(horizon=8.0, nodes=16, margins=(0.2,))
+    settings = JointPlannerSettings(horizon=8.0, nodes=16, margins=(0.2,))
     start, goal, obstacle = np.array([0.0, 0.05]), np.array([3.0, 0.0]), np.array([[1.5, 0.0]])
-    plan = SpacecraftPlanner(settings).plan(start[None], goal[None], obstacle, OBSTACLE, AGENT)
+    plan = JointPlanner(settings).plan(start[None], goal[None], obstacle, OBSTACLE, AGENT)
     assert plan.solved
 
     left = 0.5 * np.arange(15, -1, -1)
@@ -219,20 +230,18 @@ def test_around_one_obstacle_no_optimiser_does_better():
 
 def test_coarse_nodes_and_large_forces_keep_the_margin_in_between():
     # The force bends the path by up to F t^2 / 2 = 5 cm between two nodes.
-    settings = SpacecraftPlannerSettings(
-        horizon=7.0, nodes=7, margins=(0.2,), restarts=0, searches=0
-    )
+    settings = JointPlannerSettings(horizon=7.0, nodes=7, margins=(0.2,), restarts=0, searches=0)
     starts = np.array([[0.0, 0.05], [3.0, 1.6]])
     goals = np.array([[3.0, 0.0], [0.0, 1.6]])
     obstacle = np.array([[1.5, 0.0]])
-    plan = SpacecraftPlanner(settings).plan(starts, goals, obstacle, OBSTACLE, AGENT)
+    plan = JointPlanner(settings).plan(starts, goals, obstacle, OBSTACLE, AGENT)
     assert np.max(np.abs(plan.forces)) > 0.3
     check(plan, starts, goals, obstacle, settings)
 
 
 def test_agents_that_swap_places_keep_to_the_right():
     starts = np.array([[0.0, 2.5], [5.0, 2.5]])
-    plan = SpacecraftPlanner().plan(starts, starts[::-1], NONE, OBSTACLE, AGENT)
+    plan = JointPlanner().plan(starts, starts[::-1], NONE, OBSTACLE, AGENT)
     assert plan.solved
     assert plan.clearance >= 0.3
     middle = plan.states[:, 30, 1]
@@ -243,22 +252,20 @@ def test_a_symmetric_obstacle_is_left_on_the_left():
     obstacle = np.array([[2.5, 2.5]])
     for angle in np.linspace(0.0, 2.0 * np.pi, 7):
         arm = 2.0 * np.array([np.cos(angle), np.sin(angle)])
-        plan = SpacecraftPlanner().plan(
-            (obstacle - arm), (obstacle + arm), obstacle, OBSTACLE, AGENT
-        )
+        plan = JointPlanner().plan((obstacle - arm), (obstacle + arm), obstacle, OBSTACLE, AGENT)
         assert plan.solved
         away = plan.states[0, 30, :2] - obstacle[0]
         assert arm[0] * away[1] - arm[1] * away[0] < 0.0
 
 
 def test_speed_is_bounded_where_time_is_short():
-    settings = SpacecraftPlannerSettings(horizon=8.0, nodes=16)
-    plan = SpacecraftPlanner(settings).plan(
+    settings = JointPlannerSettings(horizon=8.0, nodes=16)
+    plan = JointPlanner(settings).plan(
         np.array([[0.0, 0.0]]), np.array([[5.0, 0.0]]), NONE, OBSTACLE, AGENT
     )
     assert plan.solved
     assert np.max(np.abs(plan.states[..., 2:])) == pytest.approx(0.7, abs=1e-3)
-    hasty = SpacecraftPlanner(settings).plan(
+    hasty = JointPlanner(settings).plan(
         np.array([[0.0, 0.0]]), np.array([[6.0, 0.0]]), NONE, OBSTACLE, AGENT
     )
     assert not hasty.solved
@@ -267,7 +274,7 @@ def test_speed_is_bounded_where_time_is_short():
 
 def test_replanning_takes_over_the_rest_of_a_plan():
     starts, goals, obstacles = scenario(1)
-    planner = SpacecraftPlanner()
+    planner = JointPlanner()
     whole = planner.plan(starts, goals, obstacles, OBSTACLE, AGENT)
     rest = planner.plan(whole.states[:, 20], goals, obstacles, OBSTACLE, AGENT, duration=20.0)
     assert rest.solved, rest.status
@@ -279,7 +286,7 @@ def test_replanning_takes_over_the_rest_of_a_plan():
 def test_margins_give_way_near_ends_that_lack_room_and_there_only():
     obstacle = np.array([[2.0, 0.0]])
     start, goal = np.array([[2.0, 0.85]]), np.array([[5.0, 0.0]])
-    plan = SpacecraftPlanner().plan(start, goal, obstacle, OBSTACLE, AGENT)
+    plan = JointPlanner().plan(start, goal, obstacle, OBSTACLE, AGENT)
     assert plan.solved, plan.status
     assert plan.clearance == pytest.approx(0.1, abs=6e-3)
     states, _ = plan.resample(0.1)
@@ -291,7 +298,7 @@ def test_a_smaller_margin_is_taken_where_the_larger_does_not_fit():
     # A wall of discs with one gap that fits an agent with 0.2 m on either side, too long to round.
     wall = np.array([[0.0, y] for y in np.arange(0.95, 12.0, 0.9)])
     wall = np.vstack([wall, -wall])
-    plan = SpacecraftPlanner().plan(
+    plan = JointPlanner().plan(
         np.array([[-2.0, 0.0]]), np.array([[2.0, 0.0]]), wall, OBSTACLE, AGENT
     )
     assert plan.solved, plan.status
@@ -301,7 +308,7 @@ def test_a_smaller_margin_is_taken_where_the_larger_does_not_fit():
 
 def test_the_impossible_is_reported_not_raised():
     starts, goals = np.array([[0.0, 0.0], [3.0, 0.0]]), np.array([[3.0, 3.0], [3.0, 3.2]])
-    plan = SpacecraftPlanner().plan(starts, goals, NONE, OBSTACLE, AGENT)
+    plan = JointPlanner().plan(starts, goals, NONE, OBSTACLE, AGENT)
     assert not plan.solved
     assert "overlap" in plan.status
     assert plan.clearance < 0.0
@@ -314,7 +321,7 @@ def test_failing_quadratic_programs_are_counted_and_named(monkeypatch):
 
     monkeypatch.setattr(joint_scp, "solve_qp", fail)
     starts, goals, obstacles = scenario(0)
-    plan = SpacecraftPlanner().plan(starts, goals, obstacles, OBSTACLE, AGENT)
+    plan = JointPlanner().plan(starts, goals, obstacles, OBSTACLE, AGENT)
     assert not plan.solved
     assert "broken" in plan.status
     assert np.all(np.isfinite(plan.states))
@@ -325,8 +332,8 @@ def test_candidates_never_cost_more_effort():
     starts, goals, obstacles = scenario(2)
     efforts = []
     for candidates in (1, 3):
-        settings = SpacecraftPlannerSettings(candidates=candidates)
-        plan = SpacecraftPlanner(settings).plan(starts, goals, obstacles, OBSTACLE, AGENT)
+        settings = JointPlannerSettings(candidates=candidates)
+        plan = JointPlanner(settings).plan(starts, goals, obstacles, OBSTACLE, AGENT)
         assert plan.solved
         efforts.append(np.sum(plan.effort))
     assert efforts[1] <= efforts[0]
@@ -439,7 +446,7 @@ def test_positions_beyond_all_sense_are_named():
 def test_a_goal_out_of_reach_is_a_failed_plan_after_one_program(far):
     starts = np.array([[0.0, 0.0], [1.5, 0.0]])
     goals = starts + np.array([far, 0.0])
-    plan = SpacecraftPlanner().plan(starts, goals, np.array([[3.0, 0.1]]), OBSTACLE, AGENT)
+    plan = JointPlanner().plan(starts, goals, np.array([[3.0, 0.1]]), OBSTACLE, AGENT)
     assert not plan.solved
     assert plan.attempts == 1
     assert "out of reach at speed_limit=0.7 m/s" in plan.status
@@ -448,7 +455,7 @@ def test_a_goal_out_of_reach_is_a_failed_plan_after_one_program(far):
 
 def test_agents_far_apart_are_planned_each_in_its_own_place():
     starts = np.array([[0.0, 0.0], [400.0, 300.0]])
-    plan = SpacecraftPlanner().plan(
+    plan = JointPlanner().plan(
         starts, starts + np.array([5.0, 0.0]), np.array([[2.5, 0.0]]), OBSTACLE, AGENT
     )
     assert plan.solved
@@ -476,21 +483,21 @@ def test_wrong_arguments_are_named(change, message):
         "agent_radius": AGENT,
     }
     with pytest.raises(ValueError, match=message):
-        SpacecraftPlanner().plan(**{**arguments, **change})
+        JointPlanner().plan(**{**arguments, **change})
 
 
 @pytest.mark.parametrize(
     ("settings", "change"),
     [
-        (SpacecraftPlannerSettings(), {"horizon": 0.0}),
-        (SpacecraftPlannerSettings(), {"nodes": 1}),
-        (SpacecraftPlannerSettings(), {"control_period": 0.3}),
-        (SpacecraftPlannerSettings(), {"check_period": 0.4}),
-        (SpacecraftPlannerSettings(), {"margins": ()}),
-        (SpacecraftPlannerSettings(), {"margins": (0.1, 0.3)}),
-        (SpacecraftPlannerSettings(), {"margins": (-0.1,)}),
-        (SpacecraftPlannerSettings(), {"pair_share": -1.0}),
-        (SpacecraftPlannerSettings(), {"candidates": 0}),
+        (JointPlannerSettings(), {"horizon": 0.0}),
+        (JointPlannerSettings(), {"nodes": 1}),
+        (JointPlannerSettings(), {"control_period": 0.3}),
+        (JointPlannerSettings(), {"check_period": 0.4}),
+        (JointPlannerSettings(), {"margins": ()}),
+        (JointPlannerSettings(), {"margins": (0.1, 0.3)}),
+        (JointPlannerSettings(), {"margins": (-0.1,)}),
+        (JointPlannerSettings(), {"pair_share": -1.0}),
+        (JointPlannerSettings(), {"candidates": 0}),
         (JointScpSettings(), {"penalty": 0.0}),
         (JointScpSettings(), {"max_iterations": 0}),
         (GridSettings(), {"cell": 0.0}),

@@ -5,9 +5,9 @@ import pytest
 
 from lagros_policies.contraction.double_integrator import design_axis
 from lagros_policies.planning.joint.plan import swept_distances
-from lagros_policies.tasks.spacecraft.joint_planner import (
-    SpacecraftPlanner,
-    SpacecraftPlannerSettings,
+from lagros_policies.planning.joint.planner import (
+    JointPlanner,
+    JointPlannerSettings,
 )
 
 NONE = np.empty((0, 2))
@@ -16,7 +16,7 @@ GOALS = np.array([[3.0, 0.0], [3.0, 2.0], [1.0, 4.0]])
 
 
 def test_who_arrives_early_rests_at_its_goal_without_force():
-    planner = SpacecraftPlanner()
+    planner = JointPlanner()
     plan = planner.plan(STARTS, GOALS, NONE, 0.5, 0.25, duration=np.array([10.0, 20.0, 15.3]))
     assert plan.solved
     assert plan.states.shape == (3, 41, 4)
@@ -32,7 +32,7 @@ def test_who_arrives_early_rests_at_its_goal_without_force():
 
 
 def test_one_arrival_for_all_is_the_plain_duration():
-    planner = SpacecraftPlanner()
+    planner = JointPlanner()
     one = planner.plan(STARTS, GOALS, NONE, 0.5, 0.25, duration=12.0)
     many = planner.plan(STARTS, GOALS, NONE, 0.5, 0.25, duration=np.full(3, 12.0))
     np.testing.assert_array_equal(one.states, many.states)
@@ -44,10 +44,8 @@ def test_the_begin_of_a_free_plan_is_the_optimum_of_a_quadratic():
     cost = 0.3 * design_axis(2.0, 0.1).matrix
     go = np.array([[12.0 / horizon**3, 6.0 / horizon**2], [6.0 / horizon**2, 4.0 / horizon]])
     state = np.array([[-2.0, 1.0, 0.4, -0.3]])
-    settings = SpacecraftPlannerSettings(horizon=horizon, nodes=100, margins=(0.3,))
-    plan = SpacecraftPlanner(settings).plan(
-        state, np.zeros((1, 2)), NONE, 0.5, 0.25, start_cost=cost
-    )
+    settings = JointPlannerSettings(horizon=horizon, nodes=100, margins=(0.3,))
+    plan = JointPlanner(settings).plan(state, np.zeros((1, 2)), NONE, 0.5, 0.25, start_cost=cost)
     for axis in range(2):
         begin = np.linalg.solve(go + cost, cost @ state[0, [axis, axis + 2]])
         np.testing.assert_allclose(plan.states[0, 0, [axis, axis + 2]], begin, atol=2e-3)
@@ -57,8 +55,8 @@ def test_a_plan_from_a_lost_margin_begins_clear_and_recovers_it():
     obstacle = np.array([[2.0, 0.02]])
     states = np.array([[1.28, 0.0, 0.1, 0.0], [3.0, 3.0, 0.0, 0.0]])  # overlaps by 0.03 m
     goals = np.array([[4.0, 0.0], [1.0, 3.0]])
-    settings = SpacecraftPlannerSettings(margins=(0.3,), margin_growth=0.05)
-    planner = SpacecraftPlanner(settings)
+    settings = JointPlannerSettings(margins=(0.3,), margin_growth=0.05)
+    planner = JointPlanner(settings)
     assert not planner.plan(states, goals, obstacle, 0.5, 0.25).solved
     cost = design_axis(2.0, 0.1).matrix
     plan = planner.plan(states, goals, obstacle, 0.5, 0.25, start_cost=cost)
@@ -74,6 +72,4 @@ def test_a_plan_from_a_lost_margin_begins_clear_and_recovers_it():
 
 def test_too_early_an_arrival_is_refused():
     with pytest.raises(ValueError, match="two node steps"):
-        SpacecraftPlanner().plan(
-            STARTS, GOALS, NONE, 0.5, 0.25, duration=np.array([10.0, 0.9, 9.0])
-        )
+        JointPlanner().plan(STARTS, GOALS, NONE, 0.5, 0.25, duration=np.array([10.0, 0.9, 9.0]))

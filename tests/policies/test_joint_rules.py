@@ -7,6 +7,10 @@ from lagros_envs import spacecraft_v0
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.planning.joint.plan import swept_distances
+from lagros_policies.planning.joint.planner import (
+    JointPlanner,
+    JointPlannerSettings,
+)
 from lagros_policies.planning.joint.problem import JointScpSettings
 from lagros_policies.planning.joint.scp import JointSolution
 from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
@@ -14,10 +18,6 @@ from lagros_policies.tasks.spacecraft.expert import (
     SEARCH_RADIUS,
     SpacecraftExpert,
     SpacecraftExpertSettings,
-)
-from lagros_policies.tasks.spacecraft.joint_planner import (
-    SpacecraftPlanner,
-    SpacecraftPlannerSettings,
 )
 from lagros_policies.tasks.spacecraft.pace import time_to_go
 
@@ -32,7 +32,7 @@ def test_the_way_between_coarse_nodes_is_that_of_the_mass(mass):
     obstacle = np.array([[1.5, 0.0]])
 
     def planned(mass):
-        settings = SpacecraftPlannerSettings(
+        settings = JointPlannerSettings(
             horizon=7.0,
             nodes=7,
             margins=(0.2,),
@@ -42,7 +42,7 @@ def test_the_way_between_coarse_nodes_is_that_of_the_mass(mass):
             # The effort goes with the square of the mass, and so must its price.
             scp=JointScpSettings(penalty=mass**2),
         )
-        return SpacecraftPlanner(settings).plan(starts, goals, obstacle, OBSTACLE, AGENT)
+        return JointPlanner(settings).plan(starts, goals, obstacle, OBSTACLE, AGENT)
 
     # The same motion as that of one kilogram, by forces in proportion.
     plan, reference = planned(mass), planned(1.0)
@@ -55,24 +55,24 @@ def test_the_way_between_coarse_nodes_is_that_of_the_mass(mass):
 
 
 def test_a_margin_that_grows_fast_is_kept_as_it_is_between_instants():
-    settings = SpacecraftPlannerSettings(
+    settings = JointPlannerSettings(
         margin_growth=0.6, margins=(0.5,), restarts=0, searches=0, horizon=20.0, nodes=40
     )
     starts, goals = np.array([[0.0, 0.0]]), np.array([[3.0, 0.1]])
     # The start has 1 cm of room beside the obstacle.
     obstacle = np.array([[0.0, -(OBSTACLE + AGENT + 0.01)]])
-    plan = SpacecraftPlanner(settings).plan(starts, goals, obstacle, OBSTACLE, AGENT)
+    plan = JointPlanner(settings).plan(starts, goals, obstacle, OBSTACLE, AGENT)
     assert plan.solved, plan.status
     assert plan.margin == 0.5
 
 
 def test_beside_one_that_has_arrived_the_margin_lasts_until_the_other_arrives():
-    settings = SpacecraftPlannerSettings(margins=(0.3,), restarts=1, searches=1)
+    settings = JointPlannerSettings(margins=(0.3,), restarts=1, searches=1)
     # Their goals are 0.6 m apart, so that the margin has to shrink there; the second one comes
     # along a line that is as near to the first one's goal for longer than that.
     starts, goals = np.array([[-1.5, 0.0], [3.0, 0.6]]), np.array([[0.0, 0.0], [0.0, 0.6]])
     arrivals = np.array([10.0, 30.0])
-    plan = SpacecraftPlanner(settings).plan(starts, goals, NONE, OBSTACLE, AGENT, duration=arrivals)
+    plan = JointPlanner(settings).plan(starts, goals, NONE, OBSTACLE, AGENT, duration=arrivals)
     assert plan.solved, plan.status
     motion, _ = plan.resample(0.1)
     apart = np.linalg.norm(motion[0, :, :2] - motion[1, :, :2], axis=-1)
@@ -149,7 +149,7 @@ def test_whoever_strayed_too_far_keeps_the_last_plan():
 
 def test_of_several_plans_the_one_of_least_effort_is_taken(monkeypatch):
     found = []
-    sound = SpacecraftPlanner._checked
+    sound = JointPlanner._checked
 
     def checked(self, *arguments):
         plan = sound(self, *arguments)
@@ -157,10 +157,10 @@ def test_of_several_plans_the_one_of_least_effort_is_taken(monkeypatch):
             found.append(plan.effort.sum())
         return plan
 
-    monkeypatch.setattr(SpacecraftPlanner, "_checked", checked)
-    settings = SpacecraftPlannerSettings(candidates=4, restarts=2, searches=2)
+    monkeypatch.setattr(JointPlanner, "_checked", checked)
+    settings = JointPlannerSettings(candidates=4, restarts=2, searches=2)
     starts, goals = np.array([[0.0, 2.0], [4.0, 2.0]]), np.array([[4.0, 2.2], [0.0, 1.8]])
-    plan = SpacecraftPlanner(settings).plan(starts, goals, np.array([[2.0, 2.0]]), OBSTACLE, AGENT)
+    plan = JointPlanner(settings).plan(starts, goals, np.array([[2.0, 2.0]]), OBSTACLE, AGENT)
     assert len(found) == 4
     assert max(found) > min(found)
     assert plan.effort.sum() == min(found)
@@ -175,10 +175,10 @@ def test_where_no_plan_is_found_the_one_that_violates_least_is_shown(monkeypatch
         forces = np.zeros((len(states), problem.nodes, 2))
         return JointSolution(states, forces, False, f"short by {violation}", violation, 1)
 
-    monkeypatch.setattr("lagros_policies.tasks.spacecraft.joint_planner.solve_joint", solve)
-    settings = SpacecraftPlannerSettings(margins=(0.3,), restarts=2, searches=2)
+    monkeypatch.setattr("lagros_policies.planning.joint.planner.solve_joint", solve)
+    settings = JointPlannerSettings(margins=(0.3,), restarts=2, searches=2)
     starts, goals = np.array([[0.0, 0.0]]), np.array([[3.0, 0.0]])
-    plan = SpacecraftPlanner(settings).plan(starts, goals, NONE, OBSTACLE, AGENT)
+    plan = JointPlanner(settings).plan(starts, goals, NONE, OBSTACLE, AGENT)
     assert not plan.solved
     assert "short by 0.1" in plan.status
     assert (plan.attempts, plan.iterations) == (5, 5)

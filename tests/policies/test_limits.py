@@ -10,16 +10,16 @@ from lagros_envs.tasks.cartpole.env import CartPoleEnv
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies import make
+from lagros_policies.planning.joint.planner import (
+    JointPlanner,
+    JointPlannerSettings,
+)
 from lagros_policies.planning.local.motion import Discs
 from lagros_policies.planning.local.plan import LocalPlanner
 from lagros_policies.planning.local.problem import LocalPlannerSettings
 from lagros_policies.tasks.cartpole.planner import CartPolePlanner
 from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
 from lagros_policies.tasks.spacecraft.distributed import DistributedTubeMpcPolicy
-from lagros_policies.tasks.spacecraft.joint_planner import (
-    SpacecraftPlanner,
-    SpacecraftPlannerSettings,
-)
 from lagros_policies.tasks.spacecraft.setup import plan_force_limit
 from lagros_policies.tasks.spacecraft.thrusters import allocate, to_body
 
@@ -94,8 +94,8 @@ BLOCK = np.array([[2.0, 0.1]])
 
 
 def joint(limit):
-    settings = SpacecraftPlannerSettings(force_limit=limit, margins=(0.1,))
-    return SpacecraftPlanner(settings).plan(STARTS, GOALS, BLOCK, 0.5, 0.25)
+    settings = JointPlannerSettings(force_limit=limit, margins=(0.1,))
+    return JointPlanner(settings).plan(STARTS, GOALS, BLOCK, 0.5, 0.25)
 
 
 def test_a_joint_plan_keeps_the_force_limit():
@@ -171,17 +171,17 @@ def test_weak_thrusters_are_not_asked_for_more_in_a_calm_world(name):
 def test_a_planner_of_the_users_must_keep_the_limit():
     settings = SpacecraftSettings(thrust_limit=0.3)
     for limit in (None, 0.5):
-        planner = SpacecraftPlannerSettings(force_limit=limit)
+        planner = JointPlannerSettings(force_limit=limit)
         with pytest.raises(ValueError, match=r"force_limit=.*thrust_limit leaves plans"):
             CentralizedPolicy(settings, planner=planner)
         local = LocalPlannerSettings(force_limit=limit)
         with pytest.raises(ValueError, match=r"force_limit=.*thrust_limit leaves plans"):
             DistributedTubeMpcPolicy(settings, planner=local)
-    assert CentralizedPolicy(settings, planner=SpacecraftPlannerSettings(force_limit=0.1))
+    assert CentralizedPolicy(settings, planner=JointPlannerSettings(force_limit=0.1))
 
 
 @pytest.mark.parametrize("limit", [0.0, -1.0, np.nan, np.inf])
 def test_a_limit_must_be_a_positive_number(limit):
-    for kind in (SpacecraftPlannerSettings, LocalPlannerSettings):
+    for kind in (JointPlannerSettings, LocalPlannerSettings):
         with pytest.raises(ValueError, match="force_limit="):
             kind(force_limit=limit)

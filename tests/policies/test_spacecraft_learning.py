@@ -17,13 +17,13 @@ from lagros_policies.learning.train_deep_set import (
     DeepSetTraining,
     SetSamples,
     fit_deep_set,
-    flight_samples,
     join,
 )
 from lagros_policies.tasks.spacecraft.expert import SpacecraftExpert, SpacecraftExpertSettings
 from lagros_policies.tasks.spacecraft.features import spacecraft_features
 from lagros_policies.tasks.spacecraft.flights import (
     FlightSettings,
+    flight_samples,
     fly_expert,
     make_shard,
     resize,

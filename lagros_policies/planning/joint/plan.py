@@ -1,4 +1,4 @@
-"""A joint plan of spacecraft: its motion on any grid, its true clearance, and its thrusters."""
+"""A plan of many agents in one: its motion on any grid, and its true clearance."""
 
 from __future__ import annotations
 
@@ -7,11 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import hold_step
-from lagros_envs.tasks.spacecraft.physics import HEADING, Spacecraft
 from lagros_policies.planning.joint.grid_path import segment_distance
 from lagros_policies.planning.joint.scp import positions_between
-from lagros_policies.tasks.spacecraft.thrusters import thrust_for_acceleration
 
 FloatArray = NDArray[np.float64]
 
@@ -50,7 +47,7 @@ class JointPlan:
 
     @property
     def effort(self) -> FloatArray:
-        """The integral of ||u_d||^2 = ||F||^2 / 2 per agent, shape (n,) [N^2 s]."""
+        """The integral of ||F||^2 / 2 per agent, shape (n,) [N^2 s]."""
         value: FloatArray = 0.5 * self.node_period * np.sum(self.forces**2, axis=(1, 2))
         return value
 
@@ -72,30 +69,6 @@ class JointPlan:
         )
         return np.concatenate([place, speed], axis=-1), np.repeat(self.forces, count, axis=1)
 
-    def reference(
-        self, period: float, headings: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return what the tracking law follows: the full states and accelerations.
-
-        Args:
-            period: Divides the node step [s].
-            headings: Of the agents, at rest, shape (n,) [rad]; zero if left out.
-
-        Returns:
-            x_d, shape (n, K + 1, 6), and accelerations of x, y and heading, shape (n, K, 3).
-
-        Raises:
-            ValueError: The period does not divide the node step.
-        """
-        motion, forces = self.resample(period)
-        states = np.zeros((*motion.shape[:2], 6))
-        states[..., :2], states[..., 3:5] = motion[..., :2], motion[..., 2:]
-        if headings is not None:
-            states[..., HEADING] = np.asarray(headings)[:, None]
-        accelerations = np.zeros((*forces.shape[:2], 3))
-        accelerations[..., :2] = forces / self.mass
-        return states, accelerations
-
 
 def swept_distances(places: FloatArray, obstacles: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the least distances of centres while each agent moves straight between instants.
@@ -113,34 +86,6 @@ def swept_distances(places: FloatArray, obstacles: FloatArray) -> tuple[FloatArr
     between = places[first] - places[second]
     apart = segment_distance(between[:, :-1], between[:, 1:], np.zeros((1, 2)))[..., 0]
     return gaps, apart.T
-
-
-def fly(
-    plan: JointPlan, body: Spacecraft, period: float, headings: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Carry out a plan open loop with the eight thrusters and the full dynamics.
-
-    Args:
-        plan: The plan.
-        body: The spacecraft, of the plan's mass.
-        period: Control period; divides the node step [s].
-        headings: Of the agents at the start, shape (n,) [rad]; zero if left out.
-
-    Returns:
-        States, shape (n, K + 1, 6), and u_d >= 0, shape (n, K, 8) [N].
-
-    Raises:
-        ValueError: The body has another mass, or the period does not divide the node step.
-    """
-    if body.mass != plan.mass:
-        raise ValueError(f"the plan is for mass {plan.mass!r} kg, not {body.mass!r} kg")
-    reference, accelerations = plan.reference(period, headings)
-    thrust = thrust_for_acceleration(body, reference[:, :-1], accelerations)
-    states = np.empty_like(reference)
-    states[:, 0] = reference[:, 0]
-    for step in range(thrust.shape[1]):
-        states[:, step + 1] = hold_step(body, states[:, step], thrust[:, step], period)
-    return states, thrust
 
 
 def divisor(name: str, period: float, whole: float) -> int:

@@ -13,11 +13,8 @@ from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_policies.contraction.double_integrator import planned_margin
 from lagros_policies.planning.joint.plan import JointPlan
+from lagros_policies.planning.joint.planner import JointPlanner, JointPlannerSettings
 from lagros_policies.policy import BasePolicy, Observes, PolicyState, row_memories
-from lagros_policies.tasks.spacecraft.joint_planner import (
-    SpacecraftPlanner,
-    SpacecraftPlannerSettings,
-)
 from lagros_policies.tasks.spacecraft.sensed import WorldState
 from lagros_policies.tasks.spacecraft.setup import (
     PAIR_SHARE,
@@ -25,6 +22,7 @@ from lagros_policies.tasks.spacecraft.setup import (
     check_planner_force,
     plan_force_limit,
     task_and_preset,
+    write_plan,
 )
 from lagros_policies.tasks.spacecraft.wrench_control import WrenchTracking
 
@@ -43,7 +41,7 @@ _MARGIN_GROWTH = 0.05
 
 def planner_settings(
     settings: task.SpacecraftSettings, margin: float, disturbance_bound: float = 0.0
-) -> SpacecraftPlannerSettings:
+) -> JointPlannerSettings:
     """Return how to plan the task with a margin, less of it where there is no such plan.
 
     Args:
@@ -62,7 +60,7 @@ def planner_settings(
             f"horizon={settings.horizon!r} s must be a whole number of node steps of "
             f"{_NODE_PERIOD} s; or give a planner of your own"
         )
-    return SpacecraftPlannerSettings(
+    return JointPlannerSettings(
         horizon=settings.horizon,
         nodes=nodes,
         control_period=settings.control_period,
@@ -142,7 +140,7 @@ class CentralizedPolicy(BasePolicy):
         contraction_rate: float = 2.0,
         turning_rate: float = 0.3,
         margin: float | None = None,
-        planner: SpacecraftPlannerSettings | None = None,
+        planner: JointPlannerSettings | None = None,
     ) -> None:
         """Build planner and law."""
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
@@ -155,14 +153,14 @@ class CentralizedPolicy(BasePolicy):
         wanted = planned_margin(margin, disturbance_bound, contraction_rate)
         if planner is None:
             planner = planner_settings(self.settings, wanted, disturbance_bound)
-        check_instance("planner", planner, SpacecraftPlannerSettings)
+        check_instance("planner", planner, JointPlannerSettings)
         if planner.control_period != period or planner.mass != body.mass:
             raise ValueError(
                 f"the planner is for control_period={planner.control_period!r} and "
                 f"mass={planner.mass!r}; the task has {period!r} and {body.mass!r}"
             )
         check_planner_force(planner.force_limit, plan_force_limit(self.settings, disturbance_bound))
-        self.planner = SpacecraftPlanner(planner)
+        self.planner = JointPlanner(planner)
 
     def predict(
         self,
@@ -245,12 +243,9 @@ class CentralizedPolicy(BasePolicy):
         nominal[..., 3 : SPIN + 1] = 0.0
         accelerations = np.zeros((settings.steps, self.agents, 3))
         if plan is not None and plan.solved:
-            reference, pushes = plan.reference(settings.control_period, states[:, HEADING])
-            end = first + pushes.shape[1]
-            nominal[first : end + 1] = reference.transpose(1, 0, 2)
-            nominal[end + 1 :] = reference[:, -1]
+            headings, period = states[:, HEADING], settings.control_period
+            end = write_plan(plan, first, headings, period, nominal, accelerations)
             nominal[end:, :, 3:] = 0.0
-            accelerations[first:end] = pushes.transpose(1, 0, 2)
         return CentralizedState(plan, states[:, :2].copy(), goals, nominal, accelerations)
 
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from lagros_envs.checks import check_fields, check_positive
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_envs.tasks.spacecraft.task import STATE_DIM, SpacecraftSettings
+from lagros_policies.planning.joint.planner import JointPlanner
 from lagros_policies.tasks.spacecraft.centralized import planner_settings
-from lagros_policies.tasks.spacecraft.joint_planner import SpacecraftPlanner
 from lagros_policies.tasks.spacecraft.pace import time_to_go
-from lagros_policies.tasks.spacecraft.setup import PLANE
+from lagros_policies.tasks.spacecraft.setup import PLANE, write_plan
 from lagros_policies.tasks.spacecraft.wrench_control import WrenchTracking
 
 FloatArray = NDArray[np.float64]
@@ -95,7 +95,7 @@ class SpacecraftExpert:
             searches=1,
             scp=replace(first.scp, effort_tolerance=_EFFORT_TOLERANCE),
         )
-        self.planners = SpacecraftPlanner(first), SpacecraftPlanner(again)
+        self.planners = JointPlanner(first), JointPlanner(again)
         worlds, agents = len(scenarios), scenarios[0].num_agents
         self.nominal = np.zeros((worlds, task.steps + 1, agents, STATE_DIM))
         self.pushes = np.zeros((worlds, task.steps, agents, 3))
@@ -141,15 +141,8 @@ class SpacecraftExpert:
         if not plan.solved:
             self.failed_plans += 1
             return False
-        reference, pushes = plan.reference(task.control_period, scenario.headings)
-        count = min(pushes.shape[1], task.steps - step)
-        end = step + count
-        self.nominal[world, step : end + 1] = reference.transpose(1, 0, 2)[: count + 1]
-        self.pushes[world, step:end] = pushes.transpose(1, 0, 2)[:count]
-        # At rest at the goals after the plan.
-        self.nominal[world, end + 1 :] = reference[:, count]
-        self.nominal[world, end + 1 :, :, 3:] = 0.0
-        self.pushes[world, end:] = 0.0
+        headings, period = scenario.headings, task.control_period
+        write_plan(plan, step, headings, period, self.nominal[world], self.pushes[world])
         return True
 
     def acceleration(self, step: int, states: FloatArray) -> FloatArray:

@@ -8,12 +8,11 @@ Vectors are complex numbers here: a turn is one product.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_policies.learning.deep_set import Elements, SetFeatures
 from lagros_policies.tasks.spacecraft.pace import time_to_go
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 
@@ -51,41 +50,10 @@ NEAR = 0.3  # scale of nearness = exp(-gap / NEAR) [m]
 FADE = 0.4  # what is sensed counts in full this far inside the sensing radius [m]
 
 
-class Elements(NamedTuple):
-    """The bodies of one kind that B agents sense, e in all.
-
-    Attributes:
-        values: One row for each, shape (e, f).
-        owner: Who senses it, ascending, shape (e,).
-        weight: From 0 at the rim of what is sensed to 1, shape (e,).
-    """
-
-    values: Float32Array
-    owner: NDArray[np.intp]
-    weight: Float32Array
-
-
-class SpacecraftFeatures(NamedTuple):
-    """Inputs of a network for B agents.
-
-    Attributes:
-        own: Shape (B, len(OWN)).
-        neighbours: Rows of len(NEIGHBOUR).
-        obstacles: Rows of len(OBSTACLE).
-        frame: Unit vectors to the goals as complex numbers, shape (B,); a force of the world is the
-            network's times this.
-    """
-
-    own: Float32Array
-    neighbours: Elements
-    obstacles: Elements
-    frame: ComplexArray
-
-
 def spacecraft_features(
     sensed: Sensed, settings: SpacecraftSettings, agent_radius: float, core_radius: float
-) -> SpacecraftFeatures:
-    """Return the inputs of the networks.
+) -> SetFeatures:
+    """Return the inputs of the networks; the frame is that of the goal.
 
     Args:
         sensed: The observations.
@@ -136,7 +104,7 @@ def spacecraft_features(
     table[:, 7] = touch
     weight = np.minimum((rim - centre) * (1.0 / FADE), 1.0)
     weight = np.maximum(weight, 0.0).astype(np.float32)
-    return SpacecraftFeatures(
+    return SetFeatures(
         own,
         Elements(table[:first, : len(NEIGHBOUR)], whose, weight[:first]),
         Elements(table[first:], owner, weight[first:]),

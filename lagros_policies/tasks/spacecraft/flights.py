@@ -33,8 +33,11 @@ from lagros_envs.tasks.spacecraft.sensing import Layout, observe
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.backends import LOKY, Backend
 from lagros_policies.learning.shards import Shard, make_shards
+from lagros_policies.learning.train_deep_set import SetSamples
 from lagros_policies.tasks.spacecraft.expert import SpacecraftExpert, SpacecraftExpertSettings
+from lagros_policies.tasks.spacecraft.features import spacecraft_features
 from lagros_policies.tasks.spacecraft.network_policy import SpacecraftNetworkPolicy
+from lagros_policies.tasks.spacecraft.sensed import Sensed
 
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.intp]
@@ -229,6 +232,25 @@ def make_shard(
         "success": world.info()["success"],
         "collided": world.collided,
     }
+
+
+def flight_samples(
+    data: FlightData, task: SpacecraftSettings, agent_radius: float, core_radius: float
+) -> SetSamples:
+    """Return features and labels of flights.
+
+    Args:
+        data: The flights.
+        task: Their task.
+        agent_radius: Radius of every agent against the others [m].
+        core_radius: Radius against obstacles [m].
+    """
+    sensed = Sensed.of(data.layout, data.observation)
+    features = spacecraft_features(sensed, task, agent_radius, core_radius)
+    plane = data.acceleration[:, 0] + 1j * data.acceleration[:, 1]
+    plane *= features.frame.conj()
+    target = np.stack([plane.real, plane.imag, data.acceleration[:, 2]], axis=-1)
+    return SetSamples(features, target.astype(np.float32), data.world)
 
 
 def resize(observation: Float32Array, layout: Layout, larger: Layout) -> Float32Array:

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import Layout
-from lagros_policies.learning.deep_set import DeepSet
+from lagros_policies.learning.deep_set import DeepSet, SetFeatures
 from lagros_policies.learning.network_policy import PRETRAINED
 from lagros_policies.observed import as_numbers
 from lagros_policies.policy import BasePolicy, PolicyState
-from lagros_policies.tasks.spacecraft.features import SpacecraftFeatures, spacecraft_features
+from lagros_policies.tasks.spacecraft.features import NEIGHBOUR, OBSTACLE, OWN, spacecraft_features
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.setup import (
     PUBLISHED,
@@ -27,6 +27,10 @@ from lagros_policies.trained_for import check_trained_for
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
+
+# Features of the agent itself, of a neighbour and of an obstacle; accelerations in the frame of the
+# goal and of the heading.
+_INPUTS, _OUTPUTS = (len(OWN), len(NEIGHBOUR), len(OBSTACLE)), 3
 
 
 class SpacecraftNetworkPolicy(BasePolicy):
@@ -70,6 +74,11 @@ class SpacecraftNetworkPolicy(BasePolicy):
         self.layout = Layout.for_preset(self.preset, self.settings)
         path = PRETRAINED / self.weights_file if weights is None else weights
         self.network = DeepSet.load(path)
+        if (self.network.inputs, self.network.outputs) != (_INPUTS, _OUTPUTS):
+            raise ValueError(
+                f"{path} maps {self.network.inputs} features to {self.network.outputs} numbers; a "
+                f"network of the spacecraft maps {_INPUTS} to {_OUTPUTS}"
+            )
         check_trained_for(
             self.network.metadata,
             str(path),
@@ -106,11 +115,11 @@ class SpacecraftNetworkPolicy(BasePolicy):
         wrench *= (body.mass, body.mass, 2.0 * body.inertia)
         return allocate(body, wrench)
 
-    def features(self, sensed: Sensed) -> SpacecraftFeatures:
+    def features(self, sensed: Sensed) -> SetFeatures:
         """Return the inputs of the network."""
         return spacecraft_features(sensed, self.settings, *self._radii)
 
-    def bare_forward(self, features: SpacecraftFeatures) -> Float32Array:
+    def bare_forward(self, features: SetFeatures) -> Float32Array:
         """Evaluate the network alone, for timing."""
         return self.network(features)
 

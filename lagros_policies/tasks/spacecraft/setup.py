@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lagros_envs.conventions import settings_of
+from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN
 from lagros_envs.tasks.spacecraft.scenarios import Preset, preset_named
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.trained_for import Range, body_values
+
+if TYPE_CHECKING:
+    from lagros_policies.planning.joint.plan import JointPlan
+
+FloatArray = NDArray[np.float64]
 
 # Position and velocity in the state: plans lie in the plane, at a heading that rests.
 PLANE = [0, 1, 3, 4]
@@ -62,6 +71,44 @@ def spacecraft_range(task: SpacecraftSettings, presets: Iterable[str | Preset]) 
 def radii_of(preset: Preset) -> Mapping[str, Any]:
     """Return the radii of an agent against others and against obstacles, and of an obstacle."""
     return {"radii": [preset.agent_radius, preset.core, preset.obstacle_radius]}
+
+
+def write_plan(
+    plan: JointPlan,
+    first: int,
+    headings: FloatArray,
+    period: float,
+    nominal: FloatArray,
+    accelerations: FloatArray,
+) -> int:
+    """Write what is to be followed from a control step on: a plan, and rest at its end.
+
+    Least effort never turns a body, and with opposing thrusters the effort of a force is
+    ||u||^2 = ||F||^2 / 2 whatever the heading: the plan of points is exact for the spacecraft with
+    their headings at rest.
+
+    Args:
+        plan: The plan, from that step on.
+        first: The step.
+        headings: Of the agents, which rest, shape (n,) [rad].
+        period: Control period; divides the plan's node step [s].
+        nominal: x_d at the control instants, shape (steps + 1, n, 6); written.
+        accelerations: Of x, y and heading under u_d, shape (steps, n, 3); written.
+
+    Returns:
+        The step at which the plan, or the episode, ends.
+    """
+    motion, forces = (part.transpose(1, 0, 2) for part in plan.resample(period))
+    count = min(len(forces), len(accelerations) - first)
+    end = first + count
+    nominal[first : end + 1, :, PLANE] = motion[: count + 1]
+    nominal[end + 1 :, :, :2] = motion[count, :, :2]
+    nominal[end + 1 :, :, 3:] = 0.0
+    nominal[first:, :, HEADING] = headings
+    nominal[first:, :, SPIN] = 0.0
+    accelerations[first:] = 0.0
+    accelerations[first:end, :, :2] = forces[:count] / plan.mass
+    return end
 
 
 def plan_force_limit(settings: SpacecraftSettings, disturbance_bound: float) -> float | None:

@@ -29,11 +29,15 @@ from lagros_policies.learning.train_deep_set import (
     DeepSetTraining,
     SetSamples,
     fit_deep_set,
-    flight_samples,
     join,
 )
 from lagros_policies.tasks.spacecraft.expert import SpacecraftExpertSettings
-from lagros_policies.tasks.spacecraft.flights import FlightData, FlightSettings, fly_expert
+from lagros_policies.tasks.spacecraft.flights import (
+    FlightData,
+    FlightSettings,
+    flight_samples,
+    fly_expert,
+)
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.setup import PUBLISHED, spacecraft_range
 from lagros_policies.trained_for import weights_record

@@ -1,10 +1,4 @@
-"""Target trajectories of all spacecraft at once: the paper's centralised planner (d).
-
-Least effort never turns a body, and with opposing thrusters the effort of a force is
-||u||^2 = ||F||^2 / 2 whatever the heading (see `contraction.thrusters`). So the plan is one of
-planar double integrators with the objective 1/2 sum_i int ||F_i||^2 dt, and is exact for the
-spacecraft with their headings at rest.
-"""
+"""Target trajectories of least effort for many agents at once, planar double integrators."""
 
 from __future__ import annotations
 
@@ -39,14 +33,14 @@ _RESTART_SEED = 20210
 
 
 @dataclass(frozen=True, slots=True)
-class SpacecraftPlannerSettings:
+class JointPlannerSettings:
     """The problem and how hard to look for a plan.
 
     Attributes:
         horizon: T, duration of a whole plan [s].
         nodes: N, node steps in T.
         control_period: Period of the control grid; divides the node step [s].
-        mass: m of one spacecraft [kg].
+        mass: m of one agent [kg].
         margins: Room beyond touching between an agent and an obstacle [m]; each is tried in turn
             until a plan is found, so they fall.
         pair_share: Room beyond touching between two agents, in margins.
@@ -122,16 +116,16 @@ class _Scene:
     start_cost: FloatArray | None = None  # (2, 2), see JointProblem
 
 
-class SpacecraftPlanner:
+class JointPlanner:
     """Plans (x_d, u_d) of least effort for all agents together.
 
     Args:
         settings: The problem and how hard to look.
     """
 
-    def __init__(self, settings: SpacecraftPlannerSettings | None = None) -> None:
+    def __init__(self, settings: JointPlannerSettings | None = None) -> None:
         """Remember the settings."""
-        self.settings = settings or SpacecraftPlannerSettings()
+        self.settings = settings or JointPlannerSettings()
 
     def plan(
         self,
