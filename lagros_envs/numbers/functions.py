@@ -41,6 +41,20 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
     return np.where(condition, yes, no) if own is None else own(yes, no)
 
 
+def minimum(x: Any, limit: Any) -> Any:
+    """Return the smaller of a number and a limit; NaN stays NaN. For features, not for physics."""
+    if isinstance(x, np.ndarray):
+        return np.minimum(x, limit)
+    return where(x > limit, limit, x)
+
+
+def maximum(x: Any, limit: Any) -> Any:
+    """Return the larger of a number and a limit; NaN stays NaN. For features, not for physics."""
+    if isinstance(x, np.ndarray):
+        return np.maximum(x, limit)
+    return where(x <= limit, limit, x)
+
+
 def _of(name: str, x: Any) -> Any:
     if isinstance(x, float | int):
         # `math` is ten times faster than NumPy on one number.

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.conventions import settings_of
 from lagros_envs.tasks.cartpole import task
+from lagros_policies.learning.features import See
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.observed import cartpole_rows
 from lagros_policies.policy import BasePolicy, PolicyState
-from lagros_policies.tasks.cartpole.features import FEATURES, cartpole_features
+from lagros_policies.tasks.cartpole.features import FEATURES, cartpole_features, see
 from lagros_policies.trained_for import (
     EpisodeRange,
     cartpole_range,
@@ -41,8 +43,10 @@ class NetworkPolicy(BasePolicy):
 
     Attributes:
         recorded_as: The policy that the file must name; None takes any.
+        see: What the network sees of an observation, and the signs of its outputs.
     """
 
+    see: ClassVar[See] = staticmethod(see)
     name: str
     weights_file: str
     recorded_as: str | None = None

@@ -84,7 +84,9 @@ class Mlp:
             return self._single(features)
         layer: Float32Array = features
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            layer = np.tanh(layer @ weight + bias)
+            layer = layer @ weight
+            layer += bias
+            np.tanh(layer, out=layer)
         return layer @ self.weights[-1] + self.biases[-1]
 
     def _single(self, features: Float32Array) -> Float32Array:

@@ -8,11 +8,15 @@ constant over an episode.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any, cast
+
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.tasks.cartpole import task
 from lagros_envs.tasks.cartpole.physics import ANGLE, POSITION
+from lagros_policies.learning.features import Seen, seen
 
 Float32Array = NDArray[np.float32]
 
@@ -25,10 +29,21 @@ FEATURES = (
     "initial angle [rad]",
     "time [s]",
 )
-_GOAL_POSITION = task.GOAL.start + POSITION
-_INITIAL_POSITION = task.INITIAL_STATE.start + POSITION
-_INITIAL_ANGLE = task.INITIAL_STATE.start + ANGLE
-_SOURCES = np.array([0, 1, 2, 3, _GOAL_POSITION, _INITIAL_ANGLE, task.TIME])
+_STATE, _GOAL, _START = task.STATE.start, task.GOAL.start, task.INITIAL_STATE.start
+
+
+def see(observation: Sequence[Any], functions: Any) -> Seen:
+    """Return `FEATURES` and the side of an observation."""
+    lean = observation[_START + ANGLE]
+    side = functions.where(-lean > 0.0, -1.0, 1.0)
+    goal = observation[_GOAL + POSITION]
+    sided = [
+        observation[_STATE + POSITION] - goal,
+        *(observation[index] for index in range(_STATE + ANGLE, task.STATE.stop)),
+        goal - observation[_START + POSITION],
+        lean,
+    ]
+    return Seen([*(side * number for number in sided), observation[task.TIME]], (side,))
 
 
 def cartpole_features(observation: Float32Array) -> tuple[Float32Array, Float32Array]:
@@ -41,11 +56,5 @@ def cartpole_features(observation: Float32Array) -> tuple[Float32Array, Float32A
         Features, shape (7,) or (B, 7), and the side +-1, shape () or (B,): the control is the
         network's output times the side.
     """
-    features: Float32Array = observation[..., _SOURCES]
-    features[..., 0] -= observation[..., _GOAL_POSITION]
-    features[..., 4] -= observation[..., _INITIAL_POSITION]
-    side: Float32Array = np.where(observation[..., _INITIAL_ANGLE] < 0.0, -1.0, 1.0).astype(
-        np.float32
-    )
-    features[..., :6] *= side[..., None]
-    return features, side
+    features, signs = seen(see, observation)
+    return features, cast("Float32Array", signs)[..., 0]
