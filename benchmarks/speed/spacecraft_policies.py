@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 import lagros_policies
 from lagros_envs.files import write_atomic
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
-from lagros_policies.safety.filter import SafetyFilter
+from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 
 _WORLDS, _AGENTS = 64, 6
 _EVERY = 15  # steps between the observations that are kept

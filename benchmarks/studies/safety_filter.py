@@ -42,9 +42,9 @@ from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.policy import Policy, PolicyState
 from lagros_policies.safety.barrier import BarrierSettings
-from lagros_policies.safety.filter import SafetyFilter
 from lagros_policies.safety.half_planes import nearest
 from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
+from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.thrusters import thrust_for_acceleration, to_body
 
@@ -202,7 +202,7 @@ def programs(recorder: Recorder) -> tuple[FloatArray, FloatArray, FloatArray]:
     sensed = Sensed.of(LAYOUT, observations)
     first, second, _ = SETTINGS.system.wrench(list(np.maximum(actions, 0.0).T))
     wanted = to_body(np.stack([first, second], axis=-1), -sensed.heading) / SETTINGS.system.mass
-    planes = recorder.barrier.half_planes(sensed)
+    planes = recorder.barrier.half_planes(sensed.velocity, *sensed[1:])
     box = np.broadcast_to(np.vstack([np.eye(2), -np.eye(2)]), (len(wanted), 4, 2))
     normals = np.concatenate([np.stack([planes.x, planes.y], axis=-1), box], axis=1)
     bounds = np.concatenate([planes.bounds, np.full((len(wanted), 4), -4.0)], axis=1)

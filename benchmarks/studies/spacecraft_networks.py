@@ -28,9 +28,9 @@ from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.learning.deep_set import DeepSet
 from lagros_policies.learning.train_deep_set import fit_deep_set, join
-from lagros_policies.safety.filter import SafetyFilter
 from lagros_policies.tasks.spacecraft.flights import flight_samples, fly_expert
 from lagros_policies.tasks.spacecraft.network_policy import SpacecraftNetworkPolicy
+from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 
 AGENTS = 6
 STUDY = 4242  # namespace of the worlds of this study

@@ -1,5 +1,6 @@
-"""The safety filter: the nearest action that keeps every agent clear of what it senses."""
+"""Which accelerations keep an agent clear of what it senses, and the nearest of them."""
 
-from lagros_policies.safety.filter import SafetyFilter
+from lagros_policies.safety.barrier import BarrierSettings, BrakingBarrier, HalfPlanes
+from lagros_policies.safety.half_planes import nearest
 
-__all__ = ["SafetyFilter"]
+__all__ = ["BarrierSettings", "BrakingBarrier", "HalfPlanes", "nearest"]

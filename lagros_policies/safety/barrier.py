@@ -17,7 +17,7 @@ satisfies (2/h + k) g+ >= 2 g/h + g' >= 0, and in between it is above the straig
 g (1 - k t). That n turns from hold to hold, and the disturbance, are left to the margin: that
 nothing is touched is observed, not proved.
 
-Of two agents each answers for one half of the acceleration, as both wear the filter; against an
+Of two agents each answers for one half of the acceleration, as both use the filter; against an
 obstacle the agent answers for all.
 """
 
@@ -36,9 +36,9 @@ from lagros_envs.checks import (
     check_not_negative,
     check_positive,
 )
-from lagros_policies.tasks.spacecraft.sensed import Sensed
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 # Closer centres have no direction [m].
 _SAME_PLACE = 1e-9
@@ -185,25 +185,40 @@ class BrakingBarrier:
         near = straight < knee
         return np.where(near, straight, beyond), np.where(near, rate, braking / beyond)
 
-    def half_planes(self, sensed: Sensed) -> HalfPlanes:
-        """Return the half-planes for what each of B agents senses, neighbours first."""
-        others = sensed.neighbour_mask.shape[1]
-        share, rates, braking, room = self._by_slot(others, sensed.obstacle_mask.shape[1])
+    def half_planes(
+        self,
+        velocity: FloatArray,
+        neighbours: FloatArray,
+        neighbour_mask: BoolArray,
+        obstacles: FloatArray,
+        obstacle_mask: BoolArray,
+    ) -> HalfPlanes:
+        """Return the half-planes for what each of B agents senses, neighbours first.
+
+        Args:
+            velocity: Of the agents, shape (B, 2) [m/s].
+            neighbours: Positions and velocities relative to the agent, shape (B, k, 4) [m, m/s].
+            neighbour_mask: Which slots hold one, shape (B, k).
+            obstacles: Centres relative to the agent and radii, shape (B, m, 3) [m].
+            obstacle_mask: Which slots hold one, shape (B, m).
+        """
+        others = neighbour_mask.shape[1]
+        share, rates, braking, room = self._by_slot(others, obstacle_mask.shape[1])
         h = self.period
         # From the other to the agent, so that the rate of a gap that closes is negative.
-        x, y = (_joined(sensed.neighbours[..., i], sensed.obstacles[..., i]) for i in (0, 1))
+        x, y = (_joined(neighbours[..., i], obstacles[..., i]) for i in (0, 1))
         speed_x, speed_y = np.empty_like(x), np.empty_like(y)
         for index, speed in enumerate((speed_x, speed_y)):
-            speed[:, :others] = -sensed.neighbours[..., 2 + index]
-            speed[:, others:] = sensed.velocity[:, index : index + 1]
+            speed[:, :others] = -neighbours[..., 2 + index]
+            speed[:, others:] = velocity[:, index : index + 1]
         distance = np.sqrt(x * x + y * y)
-        present = _joined(sensed.neighbour_mask, sensed.obstacle_mask)
+        present = _joined(neighbour_mask, obstacle_mask)
         scale = present / np.maximum(distance, _SAME_PLACE)
         x *= -scale
         y *= -scale
         rate = x * speed_x + y * speed_y
         coasting = distance - room + h * rate
-        coasting[:, others:] -= sensed.obstacles[..., 2]
+        coasting[:, others:] -= obstacles[..., 2]
         allowed, slope = self.allowed_speed(coasting, rates, braking)
         bounds = -share * (rate + allowed) / (h + 0.5 * h * h * slope)
         return HalfPlanes(x, y, np.where(present, bounds, -1.0), speed_x, speed_y)

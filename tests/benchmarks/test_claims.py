@@ -17,8 +17,8 @@ from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.double_integrator import certified_margin
 from lagros_policies.remarks.lagrangian import steady_position_bound
-from lagros_policies.safety.filter import SafetyFilter
 from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
+from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 from tests.benchmarks import fakes
 
 CARTPOLE = ("learned", "lagros", "tube-mpc", "lqr", "ppo", "sac", "td3", "residual", "random")

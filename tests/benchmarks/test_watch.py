@@ -301,7 +301,7 @@ def test_a_policy_that_plans_is_shown_with_its_plan(invoke, tmp_path):
 
 
 def test_the_safety_filter_is_put_on(invoke, tmp_path, monkeypatch):
-    from lagros_policies.safety import filter as safety
+    from lagros_policies.tasks.spacecraft import safety_filter as safety
 
     seen = {}
 

@@ -9,7 +9,7 @@ from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Scenario
 from lagros_envs.tasks.spacecraft.sensing import Layout, global_state, observe
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
-from lagros_policies.safety.filter import SafetyFilter
+from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.thrusters import allocate
 

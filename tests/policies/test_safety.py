@@ -14,7 +14,7 @@ from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.policy import BasePolicy, Policy
 from lagros_policies.safety.barrier import BarrierSettings, BrakingBarrier
-from lagros_policies.safety.filter import FilterState, SafetyFilter
+from lagros_policies.tasks.spacecraft.safety_filter import FilterState, SafetyFilter
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.thrusters import allocate
 from tests.policies.programs import least_violation_by_program, nearest_by_program
@@ -134,7 +134,7 @@ def test_the_force_is_changed_least_and_the_torque_is_kept():
     filtered, changed, infeasible = wearing.filter(action, sensed)
     (before, turn), (after, turned) = (acceleration_of(a, sensed) for a in (action, filtered))
     assert turned == pytest.approx(turn, abs=1e-5)
-    planes = wearing.barrier.half_planes(sensed)
+    planes = wearing.barrier.half_planes(sensed.velocity, *sensed[1:])
     checked = np.flatnonzero(changed & ~infeasible)
     assert checked.size > 30
     for row in checked[:60]:
@@ -159,7 +159,7 @@ def test_each_half_plane_is_the_condition_on_the_end_of_the_hold():
     barrier = BrakingBarrier(kept, 0.25, 0.25, PERIOD)
     layout = Layout.for_preset(PRESETS["paper"].for_agents(6), SpacecraftSettings())
     sensed = Sensed.of(layout, situations(layout, 300, seed=10, near=1.4))
-    planes = barrier.half_planes(sensed)
+    planes = barrier.half_planes(sensed.velocity, *sensed[1:])
     seen = 0
     for row in range(300):
         for slot in np.flatnonzero((planes.x[row] != 0.0) | (planes.y[row] != 0.0)):
@@ -310,7 +310,7 @@ def test_within_its_limit_the_filter_violates_least():
     sensed = Sensed.of(wearing.layout, rows)
     filtered, changed, infeasible = wearing.filter(action, sensed)
     after, _ = acceleration_of(filtered, sensed)
-    planes = wearing.barrier.half_planes(sensed)
+    planes = wearing.barrier.half_planes(sensed.velocity, *sensed[1:])
     compared = 0
     for row in np.flatnonzero(changed & infeasible):
         torque = BODY.wrench(list(action[row]))[2]

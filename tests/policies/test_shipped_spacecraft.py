@@ -12,7 +12,7 @@ from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.learning.deep_set import DeepSet
 from lagros_policies.learning.network_policy import PRETRAINED
 from lagros_policies.policy import SPACECRAFT_NAMES
-from lagros_policies.safety.filter import SafetyFilter
+from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 
 WORLDS, AGENTS = 12, 6
 

@@ -6,6 +6,7 @@ imports only what its chunk needs.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
@@ -184,18 +185,15 @@ def make_single_policy(name: str, env: Any) -> Policy:
 
 
 def make_filter(policy: Any, env: Any, disturbance_bound: float) -> Policy:
-    """Return a policy of the spacecraft that wears the safety filter.
+    """Return a policy with the safety filter of its task.
 
     Args:
         policy: The policy.
-        env: A spacecraft environment; its task and preset are taken.
+        env: An environment whose task has one.
         disturbance_bound: d_bar, in units of the state per second.
     """
-    from lagros_policies.safety.filter import SafetyFilter
-
-    filtered: Policy = SafetyFilter(
-        policy, env.settings, env.preset, disturbance_bound=disturbance_bound
-    )
+    room = importlib.import_module(f"lagros_policies.tasks.{env.settings.room}")
+    filtered: Policy = room.filtered(policy, env, disturbance_bound)
     return filtered
 
 

@@ -7,9 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN, VELOCITY_X
 from lagros_envs.tasks.spacecraft.sensing import NEIGHBOUR_DIM, OBSTACLE_DIM, Layout
 from lagros_envs.tasks.spacecraft.task import STATE_DIM
 from lagros_policies.observed import as_numbers
+from lagros_policies.tasks.spacecraft.setup import PLANE
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -85,16 +87,12 @@ class Sensed(NamedTuple):
         Raises:
             ValueError: The observation has another shape, no rows, or is not finite.
         """
-        rows = as_numbers(observation, np.float64)
-        if rows.ndim == 1:
-            rows = rows[None]
-        if rows.ndim != 2 or rows.shape[1] != layout.size:
-            raise ValueError(
-                f"the observation has shape {np.shape(observation)}; with {layout.neighbours} "
-                f"neighbours and {layout.obstacles} obstacles at most it has {layout.size} numbers:"
-                " build the policy with the environment's preset and num_agents"
-            )
-        _check_rows(rows)
+        rows = _rows(
+            observation,
+            layout.size,
+            f"with {layout.neighbours} neighbours and {layout.obstacles} obstacles at most it has "
+            f"{layout.size} numbers: build the policy with the environment's preset and num_agents",
+        )
         at, count = layout.slices, len(rows)
         return cls(
             rows[:, : at["neighbours"].start],
@@ -141,16 +139,13 @@ class WorldState(NamedTuple):
         ends = np.cumsum(
             [1, STATE_DIM * agents, 2 * agents, OBSTACLE_DIM * obstacles, obstacles]
         ).tolist()
-        rows = as_numbers(observation, np.float64)
-        if rows.ndim == 1:
-            rows = rows[None]
-        if rows.ndim != 2 or rows.shape[1] != ends[-1]:
-            raise ValueError(
-                f"the observation has shape {np.shape(observation)}; the state() of {agents} agents"
-                f" and up to {obstacles} obstacles has {ends[-1]} numbers: build the policy with "
-                "the environment's preset and num_agents, and its filter too"
-            )
-        _check_rows(rows)
+        rows = _rows(
+            observation,
+            ends[-1],
+            f"the state() of {agents} agents and up to {obstacles} obstacles has {ends[-1]} "
+            "numbers: build the policy with the environment's preset and num_agents, and its "
+            "filter too",
+        )
         time, states, goals, discs, mask = np.split(rows, ends[:-1], axis=1)
         if not np.isin(mask, (0.0, 1.0)).all():
             raise ValueError(
@@ -166,9 +161,52 @@ class WorldState(NamedTuple):
             mask > 0.0,
         )
 
+    def sensed(self, radius: float) -> Sensed:
+        """Return what every agent senses, by rows of worlds and agents.
 
-def _check_rows(rows: FloatArray) -> None:
+        The change of heading, which a global state does not tell, is zero.
+
+        Args:
+            radius: How far an agent senses [m].
+        """
+        states, moving = self.states, self.states[..., PLANE]
+        worlds, n = states.shape[:2]
+        others = np.array([[j for j in range(n) if j != i] for i in range(n)], np.intp)
+        # One agent alone has one slot for neighbours, which stays empty.
+        neighbours = np.zeros((worlds, n, max(1, n - 1), NEIGHBOUR_DIM))
+        neighbours[:, :, : n - 1] = moving[:, others.reshape(n, n - 1)] - moving[:, :, None]
+        seen = np.linalg.norm(neighbours[..., :2], axis=-1) <= radius
+        seen &= n > 1
+        rims = np.repeat(self.obstacles[:, None], n, axis=1)
+        rims[..., :2] -= states[:, :, None, :2]
+        near = np.linalg.norm(rims[..., :2], axis=-1) <= radius + rims[..., 2]
+        near &= self.obstacle_mask[:, None]
+        heading = states[..., HEADING]
+        own = (
+            self.goals - states[..., :2],
+            states[..., VELOCITY_X : VELOCITY_X + 2],
+            np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=-1),
+            states[..., [SPIN]],
+            np.repeat(self.time[:, None, None], n, axis=1),
+        )
+        return Sensed(
+            np.concatenate(own, axis=-1).reshape(worlds * n, -1),
+            neighbours.reshape(worlds * n, -1, NEIGHBOUR_DIM),
+            seen.reshape(worlds * n, -1),
+            rims.reshape(worlds * n, -1, OBSTACLE_DIM),
+            near.reshape(worlds * n, -1),
+        )
+
+
+def _rows(observation: NDArray[np.floating], size: int, wanted: str) -> FloatArray:
+    """Return observations as rows; `wanted` says what they must be."""
+    rows = as_numbers(observation, np.float64)
+    if rows.ndim == 1:
+        rows = rows[None]
+    if rows.ndim != 2 or rows.shape[1] != size:
+        raise ValueError(f"the observation has shape {np.shape(observation)}; {wanted}")
     if not len(rows):
         raise ValueError("the observation has no rows: no one is there to act")
     if not np.isfinite(rows).all():
         raise ValueError("the observation is not finite")
+    return rows

@@ -2,9 +2,9 @@
 
 The inner action makes a force in the plane and a torque. The torque is kept, and the force changed
 least, min ||a - a_0||^2, so that the acceleration a lies in one half-plane for each neighbour and
-obstacle that is sensed (`barrier`); `half_planes.nearest` answers exactly. An agent that is blocked
-is turned to pass what blocks it. Where nothing is to be changed the action is the policy's own, bit
-for bit. Nothing is silent: what the filter does is counted.
+obstacle that is sensed (`safety.barrier`); `safety.nearest` answers exactly. An agent that is
+blocked is turned to pass what blocks it. Where nothing is to be changed the action is the policy's
+own, bit for bit. Nothing is silent: what the filter does is counted.
 """
 
 from __future__ import annotations
@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import check_instance
 from lagros_envs.tasks.spacecraft import task
-from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN, VELOCITY_X
 from lagros_envs.tasks.spacecraft.scenarios import Preset
-from lagros_envs.tasks.spacecraft.sensing import OBSTACLE_DIM, Layout
+from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.observed import as_numbers
 from lagros_policies.policy import BasePolicy, Policy, PolicyState, as_policy
 from lagros_policies.safety.barrier import BarrierSettings, BrakingBarrier, HalfPlanes
 from lagros_policies.safety.half_planes import nearest
 from lagros_policies.tasks.spacecraft.sensed import Sensed, WorldState
-from lagros_policies.tasks.spacecraft.setup import PLANE, task_and_preset
+from lagros_policies.tasks.spacecraft.setup import task_and_preset
 from lagros_policies.tasks.spacecraft.thrusters import allocate, to_body
 
 Float32Array = NDArray[np.float32]
@@ -61,7 +60,7 @@ class SafetyFilter(BasePolicy):
     """A policy whose actions keep clear of what is sensed.
 
     It uses what lies within the sensing radius and the radii of the preset, also for an inner
-    policy that observes everything. Every agent is taken to wear it: of two agents, each does half.
+    policy that observes everything. Every agent is taken to use it: of two agents, each does half.
 
     Args:
         policy: The inner policy, of the spacecraft; its actions are those of the environment.
@@ -135,7 +134,11 @@ class SafetyFilter(BasePolicy):
                 finite.
         """
         rows = np.atleast_2d(as_numbers(observation, np.float64))
-        sensed = Sensed.of(self.layout, rows) if self.observes == "local" else self._sensed(rows)
+        if self.observes == "local":
+            sensed = Sensed.of(self.layout, rows)
+        else:
+            world = WorldState.of(self.preset.agents, self.layout.obstacles, rows)
+            sensed = world.sensed(self.settings.sensing_radius)
         inner, counts = self._remembered(state, len(rows), episode_start)
         wanted, inner = self.policy.predict(observation, inner, episode_start, deterministic)
         actions = self._checked(wanted, len(sensed.time))
@@ -189,7 +192,7 @@ class SafetyFilter(BasePolicy):
         turn = wrench[:, 2] / (2.0 * body.inertia)
         middle = sensed.heading + 0.5 * h * sensed.spin + 0.125 * h * h * turn
         wanted = to_body(wrench[:, :2] / body.mass, -middle)
-        planes = self.barrier.half_planes(sensed)
+        planes = self.barrier.half_planes(sensed.velocity, *sensed[1:])
         lack = planes.bounds - planes.x * wanted[:, :1] - planes.y * wanted[:, 1:]
         changed: BoolArray = np.max(lack, axis=1) > 0.0
         rows = np.flatnonzero(changed)
@@ -294,41 +297,6 @@ class SafetyFilter(BasePolicy):
         if not np.all(np.isfinite(actions)):
             raise ValueError(f"the action of {self.policy.name} is not finite")
         return actions.reshape(agents, task.THRUSTERS)
-
-    def _sensed(self, observation: NDArray[Any]) -> Sensed:
-        """Return what every agent senses, by rows of worlds and agents, from rows of `state()`.
-
-        The change of heading, which `state()` does not tell and nothing here needs, is zero.
-        """
-        n, m = self.preset.agents, self.layout.obstacles
-        time, states, goals, obstacles, mask = WorldState.of(n, m, observation)
-        worlds = len(time)
-        moving = states[..., PLANE]
-        others = np.array([[j for j in range(n) if j != i] for i in range(n)], np.intp)
-        # One agent alone has one slot for neighbours, which stays empty.
-        neighbours = np.zeros((worlds, n, self.layout.neighbours, 4))
-        neighbours[:, :, : n - 1] = moving[:, others.reshape(n, n - 1)] - moving[:, :, None]
-        seen = np.linalg.norm(neighbours[..., :2], axis=-1) <= self.settings.sensing_radius
-        seen &= n > 1
-        rims = np.repeat(obstacles[:, None], n, axis=1)
-        rims[..., :2] -= states[:, :, None, :2]
-        reach = self.settings.sensing_radius + rims[..., 2]
-        near = (np.linalg.norm(rims[..., :2], axis=-1) <= reach) & mask[:, None]
-        heading = states[..., HEADING]
-        own = (
-            goals - states[..., :2],
-            states[..., VELOCITY_X : VELOCITY_X + 2],
-            np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=-1),
-            states[..., [SPIN]],
-            np.repeat(time[:, None, None], n, axis=1),
-        )
-        return Sensed(
-            np.concatenate(own, axis=-1).reshape(worlds * n, -1),
-            neighbours.reshape(worlds * n, -1, 4),
-            seen.reshape(worlds * n, -1),
-            rims.reshape(worlds * n, -1, OBSTACLE_DIM),
-            near.reshape(worlds * n, -1),
-        )
 
 
 def _body_axes(heading: FloatArray) -> FloatArray:
