@@ -151,6 +151,9 @@ class Defaults:
         bounds: d_bar of `lagros bench`, in units of the state per second.
         bound: d_bar of the commands that take one.
         episodes: Episodes of `lagros bench`.
+        agents: Agents of each of its worlds; () for a task of one body, as in the next two.
+        preset: Of `Described.presets`.
+        safety_filter: "none", "all" policies use it, or "both" one after the other.
         attack_episodes: Episodes that `lagros attack` searches.
         attack_budget: Flights that it may spend on each.
         certify_policies: What `lagros certify` may be asked about, the first by default.
@@ -162,6 +165,9 @@ class Defaults:
     bounds: Numbers = (0.75,)
     bound: float = 0.75
     episodes: int = 50
+    agents: tuple[int, ...] = ()
+    preset: str | None = None
+    safety_filter: str = "none"
     attack_episodes: int = 10
     attack_budget: int = 1000
     certify_policies: tuple[str, ...] = ("lagros", "tube-mpc")
@@ -177,12 +183,16 @@ class Described:
         title: As in `gym.make("lagros/TITLE-v0")`.
         room: Its folder under `tasks/` of the packages above; None where it needs none.
         defaults: Of the commands.
+        most_agents: Agents that a world may have; 1 for a task of one body.
+        presets: Kinds of worlds; () for a task of one body.
     """
 
     name: str
     title: str
     room: str | None = None
     defaults = Defaults()
+    most_agents = 1
+    presets: tuple[str, ...] = ()
 
     @property
     def env_id(self) -> str:
@@ -287,6 +297,10 @@ class Task(Described):
     def success_radius(self, time: Any) -> Any:
         """Return how near the goal counts as success at a time [s] (a float or an array)."""
         return self.goal_radius + 0.0 * time
+
+    def tube_radius(self, time: Any) -> Any:
+        """Return the radius of the published tube around a plan at a time [s]; None for none."""
+        return None
 
     def goal_distance(self, state: Sequence[Any], goal: Sequence[Any], functions: Any) -> Any:
         """Return the distance from the goal: of the positions, or of the states without one."""

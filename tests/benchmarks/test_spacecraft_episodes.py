@@ -7,7 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from lagros_benchmarks.tasks.spacecraft.episodes import Trace, fly, fly_chunk, plans_of
+from lagros_benchmarks.tasks.spacecraft.episodes import (
+    Trace,
+    WorldsLoop,
+    fly,
+    fly_chunk,
+    plans_of,
+)
 from lagros_envs import spacecraft_v0
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from tests.benchmarks import spacecraft_fakes as fakes
@@ -70,7 +76,7 @@ def test_the_records_are_those_computed_by_hand(flight):
 
 def test_a_batch_is_its_worlds_one_by_one(flight):
     for seed, world in zip(SEEDS, flight.worlds, strict=True):
-        alone = fly(worlds(1), fakes.SpringPolicy(), [seed])
+        alone = fly(WorldsLoop(worlds(1), fakes.SpringPolicy()), [seed])
         for one, two in zip(world.agents, alone.worlds[0].agents, strict=True):
             assert (one.success, one.collided, one.success_time) == (
                 two.success,
@@ -89,7 +95,7 @@ def test_a_world_whose_agents_have_all_collided_is_over():
             continue
         found += 1
         others = [seed, *SEEDS[:2]]
-        record = fly(worlds(3, 2), fakes.SpringPolicy(), others).worlds[0]
+        record = fly(WorldsLoop(worlds(3, 2), fakes.SpringPolicy()), others).worlds[0]
         for agent in range(2):
             total = efforts[:, agent].sum()
             assert record.agents[agent].effort_total == pytest.approx(total, rel=1e-4)
@@ -170,7 +176,8 @@ def test_the_error_to_the_plan_is_that_of_the_states():
     agents, seeds = 2, [1, 2, 3, 4, 5, 6]
     policy = fakes.JointPolicy(agents=agents)
     trace = Trace()
-    flight = fly(worlds(len(seeds), agents), policy, seeds, 0.1, trace, keep_path=True)
+    loop = WorldsLoop(worlds(len(seeds), agents), policy)
+    flight = fly(loop, seeds, 0.1, trace)
     path = np.array(trace.path)
     planned = [bool(path[0, w, 0, 0] > 1.0) for w in range(len(seeds))]
     assert [world.planned for world in flight.worlds] == planned
@@ -180,7 +187,7 @@ def test_the_error_to_the_plan_is_that_of_the_states():
         # A world is over when all have collided.
         times = [record.collision_time for record in world.agents]
         end = len(path) if None in times else round(10 * max(times)) + 1
-        nominal = trace.state[index].nominal[:end, :, :2]
+        nominal = loop.memory[index].nominal[:end, :, :2]
         error = np.linalg.norm(path[:end, index] - nominal, axis=-1).max(axis=0)
         for agent, record in enumerate(world.agents):
             assert record.max_position_error == pytest.approx(error[agent], rel=1e-6)
@@ -199,8 +206,8 @@ def test_without_a_plan_there_is_no_tube(flight):
 
 def test_the_plans_are_found_behind_a_filter():
     joint = fakes.JointPolicy(agents=2)
-    bare = fly(worlds(2, 2), joint, [1, 2], 0.1)
-    filtered = fly(worlds(2, 2), fakes.HalfFilter(joint), [1, 2], 0.1)
+    bare = fly(WorldsLoop(worlds(2, 2), joint), [1, 2], 0.1)
+    filtered = fly(WorldsLoop(worlds(2, 2), fakes.HalfFilter(joint)), [1, 2], 0.1)
     assert [w.planned for w in filtered.worlds] == [w.planned for w in bare.worlds]
     assert filtered.counters == {"interventions": 2 * 2 * 450}
     assert plans_of(None) is None

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from lagros_benchmarks.run.flying import Attempt, ask, counted, reseed
+from lagros_benchmarks.run.closed_loop import ClosedLoop
+from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.library import Environment, FloatArray, Policy
 
 # Both tubes begin with radius zero, where a plan's rounding must not count as leaving them. The
 # planner promises its plans to the same accuracy.
 TUBE_TOLERANCE = 1e-6
 
-# Shape of the action.
 ACTION = (1,)
 # What a policy counts by the clock, which is another number every time.
 TIMED_COUNTERS = ("late_plans",)
@@ -35,12 +34,13 @@ class EpisodeRecord:
         bound: d_bar, in units of the state per second.
         success: The paper's: at some control instant ||x - x_f|| <= r(t).
         success_time: t*, the first such instant [s]; None if there was none.
-        strict_success: Inside the tube around the goal at the time limit, never fallen.
-        fallen: The pole fell, which ends the episode.
-        effort: The integral of ||u||^2 to t*, else to the end [N^2 s].
-        effort_total: The same to the end of the episode, successful or not [N^2 s].
+        strict_success: Inside the tube around the goal at the time limit, never fallen or collided.
+        fallen: The state left what the task allows (`Task.fallen`), which ends the episode.
+        collided: The body touched a disc, which ends the episode.
+        effort: The integral of ||u||^2 from the centre of the control to t*, else to the end.
+        effort_total: The same to the end of the episode, successful or not.
         left_paper_tube: ||x - x_d|| exceeded the paper tube, or the episode ended early, or it has
-            no plan x_d.
+            no plan x_d; None for a task without a published tube.
         left_certified_tube: None: no certified tube of ours is about a flight of this task
             (`claims`).
         max_tracking_error: The largest ||x - x_d||; None without a plan.
@@ -60,9 +60,10 @@ class EpisodeRecord:
     success_time: float | None
     strict_success: bool
     fallen: bool
+    collided: bool
     effort: float
     effort_total: float
-    left_paper_tube: bool
+    left_paper_tube: bool | None
     left_certified_tube: None
     max_tracking_error: float | None
     counters: dict[str, int]
@@ -71,26 +72,6 @@ class EpisodeRecord:
     tracking_error: FloatArray = field(compare=False, repr=False)
     step_times: FloatArray = field(compare=False, repr=False)
     deadline_misses: int = field(compare=False)
-
-
-@dataclass
-class _Trace:
-    """What an episode has left behind so far, whole even if the next call raises."""
-
-    info: dict[str, Any] = field(default_factory=dict)
-    errors: list[float] = field(default_factory=list)
-    step_times: list[float] = field(default_factory=list)
-    state: Any = None
-    counters: dict[str, int] = field(default_factory=dict)
-    reached_limit: bool = False
-
-    def note(self, info: dict[str, Any]) -> None:
-        """Keep the info of an instant."""
-        self.info = info
-        if "tracking_error" in info:
-            error = float(info["tracking_error"])
-            # A state that overflowed is infinitely far away, not unmeasured.
-            self.errors.append(math.inf if math.isnan(error) else error)
 
 
 def added_up(counters: Iterable[Mapping[str, int]]) -> dict[str, int]:
@@ -116,7 +97,7 @@ def run_episode(
     down with its text; it is never raised and the episode is never dropped.
 
     Args:
-        env: A cart-pole environment.
+        env: An environment of one body.
         policy: The policy.
         seed: Seed of the episode.
         nominal: x_d at every control instant, or None if there is no plan.
@@ -125,51 +106,43 @@ def run_episode(
     Returns:
         The record of the episode.
     """
-    trace = _Trace()
+    loop = ClosedLoop(env, policy)
+    errors: list[float] = []
+    counters: dict[str, int] = {}
     with Attempt() as attempt:
-        _play(env, policy, seed, nominal, trace)
+        for _ in loop.fly(seed, {} if nominal is None else {"nominal": nominal}):
+            if "tracking_error" in loop.info:
+                error = float(loop.info["tracking_error"])
+                # A state that overflowed is infinitely far away, not unmeasured.
+                errors.append(math.inf if math.isnan(error) else error)
     # A planner's count of failed plans matters most in the episode that raised.
     with Attempt() as counting:
-        trace.counters = counted(policy, trace.state)
+        counters = loop.counters()
     name = label or str(getattr(policy, "name", policy))
-    return _record(env, name, seed, trace, attempt.error or counting.error)
-
-
-def _play(
-    env: Environment, policy: Policy, seed: int, nominal: FloatArray | None, trace: _Trace
-) -> None:
-    reseed(policy, seed)
-    options = {} if nominal is None else {"nominal": nominal}
-    # The observation of the cart-pole is all that there is: local and global are the same.
-    observation, info = env.reset(seed=seed, options=options)
-    trace.note(info)
-    terminated = truncated = False
-    while not (terminated or truncated):
-        first = not trace.step_times
-        action, trace.state, seconds = ask(policy, observation, trace.state, [first], ACTION)
-        trace.step_times.append(seconds)
-        observation, _, terminated, truncated, info = env.step(action)
-        trace.note(info)
-    trace.reached_limit = truncated and not terminated
+    return _record(loop, name, seed, errors, counters, attempt.error or counting.error)
 
 
 def _record(
-    env: Environment,
+    loop: ClosedLoop,
     label: str,
     seed: int,
-    trace: _Trace,
+    errors: Sequence[float],
+    counters: Mapping[str, int],
     problem: str | None,
 ) -> EpisodeRecord:
-    world: Any = env.unwrapped
-    period = world.settings.control_period
-    steps = world.settings.steps
-    errors = np.full(steps + 1, np.nan)
-    errors[: len(trace.errors)] = trace.errors
-    times = period * np.arange(steps + 1)
-    info = trace.info
+    world, info = loop.env.unwrapped, loop.info
+    task = world.settings
+    tracking = np.full(task.steps + 1, np.nan)
+    tracking[: len(errors)] = errors
+    radius = task.tube_radius(task.control_period * np.arange(task.steps + 1))
+    reached_limit = bool(loop.truncated and not loop.terminated)
     success = bool(info.get("success", False)) and problem is None
-    fallen = bool(info.get("fallen", False))
-    step_times = np.array(trace.step_times)
+    fallen, collided = bool(info.get("fallen", False)), bool(info.get("collided", False))
+    left = None
+    if radius is not None:
+        # `not all inside`: nan (no plan, or an early end) counts as outside.
+        left = fallen or collided or not bool(np.all(tracking <= radius + TUBE_TOLERANCE))
+    step_times = np.array(loop.step_times)
     return EpisodeRecord(
         seed=seed,
         policy=label,
@@ -177,22 +150,18 @@ def _record(
         bound=float(world.disturbance.bound),
         success=success,
         success_time=float(info["success_time"]) if success else None,
-        strict_success=problem is None and trace.reached_limit and bool(info["inside_tube"]),
+        strict_success=problem is None and reached_limit and bool(info["inside_tube"]),
         fallen=fallen,
+        collided=collided,
         effort=float(info.get("effort_to_success", 0.0)),
         effort_total=float(info.get("effort", 0.0)),
-        left_paper_tube=fallen or _left(errors, np.asarray(world.settings.tube.radius(times))),
+        left_paper_tube=left,
         left_certified_tube=None,
-        max_tracking_error=max(trace.errors) if trace.errors else None,
-        counters={n: count for n, count in trace.counters.items() if n not in TIMED_COUNTERS},
+        max_tracking_error=max(errors) if errors else None,
+        counters={n: count for n, count in counters.items() if n not in TIMED_COUNTERS},
         error=problem,
-        timed_counters={n: count for n, count in trace.counters.items() if n in TIMED_COUNTERS},
-        tracking_error=errors,
+        timed_counters={n: count for n, count in counters.items() if n in TIMED_COUNTERS},
+        tracking_error=tracking,
         step_times=step_times,
-        deadline_misses=int(np.count_nonzero(step_times > period)),
+        deadline_misses=int(np.count_nonzero(step_times > task.control_period)),
     )
-
-
-def _left(errors: FloatArray, radius: FloatArray) -> bool:
-    # `not all inside`: nan (no plan, or an early end) counts as outside.
-    return not bool(np.all(errors <= radius + TUBE_TOLERANCE))

@@ -30,7 +30,7 @@ from lagros_benchmarks.tasks.cartpole.worst_case import (
     random_pushes,
     tracking_law,
 )
-from lagros_benchmarks.tasks.spacecraft.episodes import bare, rehearse_in
+from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, bare
 from lagros_benchmarks.tasks.spacecraft.plane import worst_plane_pushes
 from lagros_benchmarks.tasks.spacecraft.worst_case import (
     PARAMETERS,
@@ -304,7 +304,8 @@ def _targets(settings: AttackSettings) -> list[SpacecraftTarget]:
     env = SpacecraftVectorEnv(
         settings.agents, settings.agents, settings.preset, "none", settings.bound
     )
-    rehearse_in(env, settings.policy, make_single_policy(settings.policy, env))
+    first = make_single_policy(settings.policy, env)
+    WorldsLoop(env, first).rehearse(f"policy {settings.policy!r}", [0])
     policy = make_single_policy(settings.policy, env)
     if settings.safety_filter:
         with building(f"policy {settings.policy!r} with the safety filter"):

@@ -139,6 +139,10 @@ class CartPoleSettings(Task):
         """Return by how much the pole leans beyond the angle at which it has fallen [rad]."""
         return abs(state[1]) - FALL_ANGLE
 
+    def tube_radius(self, time: Any) -> Any:
+        """Return the same radius, which the paper publishes for x_d, too."""
+        return self.tube.radius(time)
+
     def fallen(self, state: Sequence[Any], functions: Any) -> Any:
         """Return whether the pole has fallen."""
         return abs(state[1]) > FALL_ANGLE

@@ -24,6 +24,7 @@ from lagros_envs.checks import (
 from lagros_envs.options import nominal_option
 from lagros_envs.task import Defaults, Described
 from lagros_envs.tasks.spacecraft.physics import Spacecraft
+from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS
 from lagros_envs.tube import PaperTube
 from lagros_envs.values import use_plain_numbers
 
@@ -83,10 +84,14 @@ class SpacecraftSettings(Described):
     collision_penalty: float = 5.0
 
     name, title, room = "spacecraft", "Spacecraft", "spacecraft"
+    most_agents, presets = MOST_AGENTS, tuple(PRESETS)
     defaults = Defaults(
         policies=("learned", "tube-mpc", "lagros", "centralized"),
         bounds=(0.2, 0.4, 0.6, 0.8, 1.0),
         bound=0.4,
+        agents=(6,),
+        preset="paper",
+        safety_filter="both",
         attack_episodes=3,
         attack_budget=100,
         certify_policies=("lagros", "centralized"),

@@ -127,7 +127,8 @@ def _step_times(records: Sequence[EpisodeRecord]) -> Row:
 def _tracking(run: CartPoleRun, case: Case) -> Row:
     records = run.episodes[case]
     row: Row = {
-        "tube_violation_rate": sum(record.left_paper_tube for record in records) / len(records),
+        "tube_violation_rate": sum(bool(record.left_paper_tube) for record in records)
+        / len(records),
         # No certified tube of ours is about these flights: see `claims`.
         "certified_violation_rate": None,
         "plans_failed": sum(plan.states is None for plan in run.plans),

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.episodes import TUBE_TOLERANCE, added_up
-from lagros_benchmarks.run.flying import Answer, Attempt, ask, counted, rehearse, reseed
+from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.library import FloatArray, Policy
 from lagros_envs.tasks.spacecraft.task import THRUSTERS
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 
 BoolArray = NDArray[np.bool_]
-Float32Array = NDArray[np.float32]
 
 # Memories of a policy within those of what it wears.
 _MOST_WRAPPED = 4
@@ -96,6 +96,48 @@ class Flight:
     counters: dict[str, int]
 
 
+class WorldsLoop(ClosedLoop):
+    """Worlds and the policy that flies all of their agents, whether it is fed rows or worlds.
+
+    Attributes:
+        nominal: x_d, shape (worlds, steps + 1, agents, 6), where the policy has planned the whole
+            episode of every world at its start; else None.
+        planned: Which worlds have a plan, shape (worlds,), or None.
+    """
+
+    env: SpacecraftVectorEnv
+    nominal: FloatArray | None = None
+    planned: BoolArray | None = None
+
+    def begin(self, seed: Any, options: dict[str, Any] | None = None) -> None:
+        """Reset the worlds, none of which has a plan then."""
+        self.nominal = self.planned = None
+        super().begin(seed, options)
+
+    def decide(self) -> None:
+        """Ask the policy for the actions of all agents, and at the start for its plans."""
+        super().decide()
+        if self.step == 0:
+            self._find_plans()
+
+    def seen(self) -> Any:
+        """Return the rows of all agents, or `state()` of all worlds where it observes "global"."""
+        return self.env.state() if is_global(self.policy) else self.observation
+
+    def shapes(self) -> list[tuple[int, ...]]:
+        """Return the shapes that the actions may have."""
+        return shapes_of(self.policy, self.env.num_worlds, self.env.num_agents)
+
+    def _find_plans(self) -> None:
+        plans = plans_of(self.memory)
+        wanted = (self.env.settings.steps + 1, self.env.num_agents, 6)
+        if plans is None or len(plans) != self.env.num_worlds:
+            return
+        if all(np.shape(plan.nominal) == wanted for plan in plans):
+            self.nominal = np.stack([plan.nominal for plan in plans])
+            self.planned = np.array([bool(plan.solved) for plan in plans])
+
+
 @dataclass
 class Trace:
     """What a batch has left behind so far, whole even if the next call raises.
@@ -103,47 +145,46 @@ class Trace:
     Attributes:
         info: The measures of every agent, each of shape (worlds, agents); those of a world that
             has ended stay as they were at its end.
-        over: Which worlds have ended, shape (worlds,).
-        state: The policy's memory.
-        nominal: x_d, shape (worlds, steps + 1, agents, 6), or None.
-        planned: Which worlds have a plan, shape (worlds,), or None.
         left_paper: Who left the paper tube, shape (worlds, agents).
         position_error: Largest so far, shape (worlds, agents) [m].
         path: Positions at every control instant, each of shape (worlds, agents, 2) [m].
     """
 
     info: dict[str, Any] = field(default_factory=dict)
-    over: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
-    state: Any = None
-    nominal: FloatArray | None = None
-    planned: BoolArray | None = None
     left_paper: BoolArray = field(default_factory=lambda: np.zeros((0, 0), bool))
     position_error: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     path: list[FloatArray] = field(default_factory=list)
+    _going: BoolArray = field(default_factory=lambda: np.zeros((0, 0), bool))
+    _start: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 6)))
 
+    def note(self, loop: WorldsLoop) -> None:
+        """Note where everybody is and how each fared."""
+        env, shape = loop.env, (loop.env.num_worlds, loop.env.num_agents)
+        if loop.step == 0:
+            self._going, self._start = np.ones(shape, bool), env.states.copy()
+            self.left_paper, self.position_error = np.zeros(shape, bool), np.zeros(shape)
+        latest = {name: np.asarray(loop.info[name]).reshape(shape) for name in _MEASURES}
+        self.info = {
+            name: np.where(self._going, value, self.info.get(name, value))
+            for name, value in latest.items()
+        }
+        self.path.append(env.states[..., :2].copy())
+        if loop.nominal is not None and loop.step > 0:
+            if loop.step == 1:
+                self._hold_against_tube(loop, self._start, 0)
+            self._hold_against_tube(loop, env.states, loop.step)
+        self._going = ~loop.ended.reshape(shape)
 
-def act(
-    policy: Policy, env: SpacecraftVectorEnv, rows: Float32Array, state: Any, first: bool
-) -> Answer:
-    """Ask the policy for the actions of all agents of all worlds.
-
-    Args:
-        policy: Fed the rows if it observes "local", `state()` if "global".
-        env: The worlds.
-        rows: Observations of all agents, shape (worlds * agents, o).
-        state: What the last call returned.
-        first: Whether the episodes begin.
-
-    Returns:
-        Actions, shape (worlds * agents, 8), the policy's memory, and the time of the call.
-
-    Raises:
-        ValueError: The policy's answer is not such actions.
-    """
-    observation = env.state() if is_global(policy) else rows
-    starts = np.full(len(observation), first)
-    shapes = shapes_of(policy, env.num_worlds, env.num_agents)
-    return ask(policy, observation, state, starts, *shapes)
+    def _hold_against_tube(self, loop: WorldsLoop, states: FloatArray, instant: int) -> None:
+        assert loop.nominal is not None
+        # What overflowed is infinitely far away, not unmeasured.
+        error = np.nan_to_num(states - loop.nominal[:, instant], nan=np.inf)
+        settings = loop.env.settings
+        radius = settings.tube.radius(instant * settings.control_period) + TUBE_TOLERANCE
+        self.left_paper |= self._going & (np.linalg.norm(error, axis=-1) > radius)
+        distance = np.linalg.norm(error[..., :2], axis=-1)
+        largest = np.maximum(self.position_error, distance)
+        self.position_error = np.where(self._going, largest, self.position_error)
 
 
 def shapes_of(policy: Policy, worlds: int, agents: int) -> list[tuple[int, ...]]:
@@ -159,23 +200,6 @@ def is_global(policy: Policy) -> bool:
     return getattr(policy, "observes", "local") == "global"
 
 
-def rehearse_in(env: SpacecraftVectorEnv, name: str, policy: Policy) -> None:
-    """Ask a policy once in a world, so that what its first call loads is not timed.
-
-    Args:
-        env: One world.
-        name: The policy, as the run was asked for it.
-        policy: The policy.
-
-    Raises:
-        SetupError: It cannot run.
-    """
-    rows, _ = env.reset(seed=[0])
-    seen = env.state() if is_global(policy) else rows
-    shapes = shapes_of(policy, 1, env.num_agents)
-    rehearse(f"policy {name!r}", policy, seen, np.ones(len(seen), bool), *shapes)
-
-
 def bare(policy: Policy) -> Policy:
     """Return a policy without the safety filter that it wears, which has it as `policy`.
 
@@ -188,24 +212,17 @@ def bare(policy: Policy) -> Policy:
 
 
 def fly(
-    env: SpacecraftVectorEnv,
-    policy: Policy,
-    seeds: Sequence[int],
-    margin: float | None = None,
-    trace: Trace | None = None,
-    keep_path: bool = False,
+    loop: WorldsLoop, seeds: Sequence[int], margin: float | None = None, trace: Trace | None = None
 ) -> Flight:
     """Fly one batch of worlds to their end.
 
     An exception in the policy or the environment ends the batch; it is written down and not raised.
 
     Args:
-        env: The worlds, one per seed, without autoreset.
-        policy: The policy.
+        loop: The worlds, one per seed, without autoreset, and the policy.
         seeds: Seeds of the episodes.
         margin: Certified bound of the position error to x_d [m], or None.
         trace: Filled as the batch flies; for those who want more than the records.
-        keep_path: Whether the trace keeps where everybody was.
 
     Returns:
         The records and counters.
@@ -213,11 +230,12 @@ def fly(
     trace = Trace() if trace is None else trace
     counters: dict[str, int] = {}
     with Attempt() as attempt:
-        _fly(env, policy, seeds, trace, keep_path)
+        for _ in loop.fly(list(seeds)):
+            trace.note(loop)
     with Attempt() as counting:
-        counters = counted(policy, trace.state)
+        counters = loop.counters()
     problem = attempt.error or counting.error
-    return Flight(tuple(_records(env, seeds, trace, problem, margin)), counters)
+    return Flight(tuple(_records(loop, seeds, trace, problem, margin)), counters)
 
 
 def fly_chunk(
@@ -239,59 +257,13 @@ def fly_chunk(
     # What a policy draws comes from the stream of one episode.
     alone = len(seeds) == 1 or as_policy(bare(policy)).draws
     if not alone:
-        flight = fly(make_env(len(seeds)), policy, seeds, margin)
+        flight = fly(WorldsLoop(make_env(len(seeds)), policy), seeds, margin)
         if all(world.error is None for world in flight.worlds):
             return flight
-    env = make_env(1)
-    flights = [fly(env, policy, [seed], margin) for seed in seeds]
+    loop = WorldsLoop(make_env(1), policy)
+    flights = [fly(loop, [seed], margin) for seed in seeds]
     counters = added_up(flight.counters for flight in flights)
     return Flight(tuple(world for flight in flights for world in flight.worlds), counters)
-
-
-def _fly(
-    env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int], trace: Trace, keep_path: bool
-) -> None:
-    shape = (env.num_worlds, env.num_agents)
-    trace.over = np.zeros(shape[0], bool)
-    trace.left_paper, trace.position_error = np.zeros(shape, bool), np.zeros(shape)
-    reseed(policy, seeds[0])
-    rows, info = env.reset(seed=list(seeds))
-    _note(trace, env, info, keep_path)
-    for step in range(env.settings.steps):
-        action, trace.state, _ = act(policy, env, rows, trace.state, step == 0)
-        if step == 0:
-            _find_plans(trace, policy, env)
-            _hold_against_tube(trace, env, 0)
-        # A world that has ended only keeps the batch whole.
-        action[np.repeat(trace.over, shape[1])] = 0.0
-        rows, _, terminated, truncated, info = env.step(action)
-        _note(trace, env, info, keep_path)
-        _hold_against_tube(trace, env, step + 1)
-        trace.over = trace.over | (terminated | truncated).reshape(shape)[:, 0]
-        if trace.over.all():
-            return
-
-
-def _note(trace: Trace, env: SpacecraftVectorEnv, info: dict[str, Any], keep_path: bool) -> None:
-    shape = (env.num_worlds, env.num_agents)
-    latest = {name: np.asarray(info[name]).reshape(shape) for name in _MEASURES}
-    going = ~trace.over[:, None]
-    trace.info = {
-        name: np.where(going, value, trace.info.get(name, value)) for name, value in latest.items()
-    }
-    if keep_path:
-        trace.path.append(env.states[..., :2].copy())
-
-
-def _find_plans(trace: Trace, policy: Policy, env: SpacecraftVectorEnv) -> None:
-    """Take x_d from the memory of a policy that planned the whole episode of every world."""
-    plans = plans_of(trace.state)
-    if plans is None or len(plans) != env.num_worlds:
-        return
-    wanted = (env.settings.steps + 1, env.num_agents, 6)
-    if all(np.shape(plan.nominal) == wanted for plan in plans):
-        trace.nominal = np.stack([plan.nominal for plan in plans])
-        trace.planned = np.array([bool(plan.solved) for plan in plans])
 
 
 def plans_of(state: Any) -> Sequence[Any] | None:
@@ -308,22 +280,8 @@ def plans_of(state: Any) -> Sequence[Any] | None:
     return None
 
 
-def _hold_against_tube(trace: Trace, env: SpacecraftVectorEnv, instant: int) -> None:
-    if trace.nominal is None:
-        return
-    going = ~trace.over[:, None]
-    # What overflowed is infinitely far away, not unmeasured.
-    error = np.nan_to_num(env.states - trace.nominal[:, instant], nan=np.inf)
-    radius = env.settings.tube.radius(instant * env.settings.control_period) + TUBE_TOLERANCE
-    trace.left_paper |= going & (np.linalg.norm(error, axis=-1) > radius)
-    distance = np.linalg.norm(error[..., :2], axis=-1)
-    trace.position_error = np.where(
-        going, np.maximum(trace.position_error, distance), trace.position_error
-    )
-
-
 def _records(
-    env: SpacecraftVectorEnv,
+    loop: WorldsLoop,
     seeds: Sequence[int],
     trace: Trace,
     problem: str | None,
@@ -332,10 +290,11 @@ def _records(
     return [
         WorldRecord(
             seed=int(seed),
-            planned=None if trace.planned is None else bool(trace.planned[world]),
+            planned=None if loop.planned is None else bool(loop.planned[world]),
             error=problem,
             agents=tuple(
-                _agent(trace, world, agent, problem, margin) for agent in range(env.num_agents)
+                _agent(loop, trace, world, agent, problem, margin)
+                for agent in range(loop.env.num_agents)
             ),
         )
         for world, seed in enumerate(seeds)
@@ -343,18 +302,23 @@ def _records(
 
 
 def _agent(
-    trace: Trace, world: int, agent: int, problem: str | None, margin: float | None
+    loop: WorldsLoop,
+    trace: Trace,
+    world: int,
+    agent: int,
+    problem: str | None,
+    margin: float | None,
 ) -> AgentRecord:
-    if not trace.info:  # not even the reset came to an end
-        return _nothing()
+    # Empty where not even the reset came to an end.
     one = {name: values[world, agent].item() for name, values in trace.info.items()}
     ran = problem is None
     success = ran and bool(one["success"])
+    collided = bool(one.get("collided", False))
     left_paper = left_certified = None
     error: float | None = None
-    if trace.nominal is not None and trace.planned is not None:
+    if loop.nominal is not None and loop.planned is not None:
         error = float(trace.position_error[world, agent])
-        kept = ran and bool(trace.planned[world])
+        kept = ran and bool(loop.planned[world])
         left_paper = not kept or bool(trace.left_paper[world, agent])
         if margin is not None:
             left_certified = not kept or error > margin + TUBE_TOLERANCE
@@ -363,29 +327,12 @@ def _agent(
         success_time=one["success_time"] if success else None,
         strict_success=ran and bool(one["strict_success"]),
         paper_success=ran and bool(one["paper_success"]),
-        collided=bool(one["collided"]),
-        collision_time=one["collision_time"] if one["collided"] else None,
-        effort=one["effort_to_success"],
-        effort_total=one["effort"],
-        goal_distance=one["goal_distance"],
+        collided=collided,
+        collision_time=one["collision_time"] if collided else None,
+        effort=one.get("effort_to_success", 0.0),
+        effort_total=one.get("effort", 0.0),
+        goal_distance=one.get("goal_distance", float("nan")),
         left_paper_tube=left_paper,
         left_certified_tube=left_certified,
         max_position_error=error,
-    )
-
-
-def _nothing() -> AgentRecord:
-    return AgentRecord(
-        success=False,
-        success_time=None,
-        strict_success=False,
-        paper_success=False,
-        collided=False,
-        collision_time=None,
-        effort=0.0,
-        effort_total=0.0,
-        goal_distance=float("nan"),
-        left_paper_tube=None,
-        left_certified_tube=None,
-        max_position_error=None,
     )

@@ -18,10 +18,10 @@ from lagros_benchmarks.tasks.spacecraft.episodes import (
     Flight,
     Trace,
     WorldRecord,
+    WorldsLoop,
     fly,
     fly_chunk,
     is_global,
-    rehearse_in,
 )
 from lagros_benchmarks.tasks.spacecraft.timing import PLAN_WORLDS, Timing, time_plans, time_policy
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
@@ -104,7 +104,7 @@ class SpacecraftExperiment:
             policy = experiment.policy(case, env)
             if case.policy not in rehearsed:
                 rehearsed.add(case.policy)
-                rehearse_in(env, case.policy, policy)
+                WorldsLoop(env, policy).rehearse(f"policy {case.policy!r}", [0])
         return cls(settings, toolbox, period)
 
     @property
@@ -162,7 +162,7 @@ class SpacecraftExperiment:
         """Measure the times of the calls, and of more plans than those worlds need."""
         env = self.environment(case, 1)
         policy = self.policy(case, env)
-        rehearse_in(env, case.policy, policy)
+        WorldsLoop(env, policy).rehearse(f"policy {case.policy!r}", [0])
         timing = time_policy(env, policy, units)
         if not is_global(policy):
             return [timing]
@@ -221,7 +221,7 @@ def fly_scene(settings: BenchmarkSettings, world: int, toolbox: Toolbox) -> Scen
         case = Case(policy, condition, filtered, agents)
         env = experiment.environment(case, 1)
         trace = Trace()
-        flight = fly(env, experiment.policy(case, env), [seeds[world]], None, trace, True)
+        flight = fly(WorldsLoop(env, experiment.policy(case, env)), [seeds[world]], None, trace)
         panels.append(ScenePanel(case, np.array(trace.path)[:, 0], flight.worlds[0]))
     scenario = env.scenarios[0]
     if scenario is None:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lagros_benchmarks.run.flying import Attempt, ask, reseed
+from lagros_benchmarks.run.flying import Attempt, ask
 from lagros_benchmarks.run.library import FloatArray, Policy
-from lagros_benchmarks.tasks.spacecraft.episodes import act, is_global
+from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, is_global
 from lagros_envs.tasks.spacecraft.task import THRUSTERS
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 
@@ -53,58 +53,47 @@ def time_policy(env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int]) 
     Returns:
         The times.
     """
+    loop = WorldsLoop(env, policy)
     steps: list[float] = []
     batches: list[float] = []
     plans: list[float] = []
     raised = 0
     for index, seed in enumerate(seeds):
         alone = None if is_global(policy) else index % env.num_agents
-        times = _WorldTimes([], [])
+        own: list[float] = []
         with Attempt() as attempt:
-            _time_world(env, policy, seed, alone, times)
+            _time_world(loop, seed, alone, own)
         raised += attempt.error is not None
-        batches += times.batches
+        batches += loop.step_times
         if alone is None:
-            plans += times.batches[:1]
-            steps += times.batches[1:]
+            plans += loop.step_times[:1]
+            steps += loop.step_times[1:]
         else:
-            steps += times.alone
+            steps += own
     return Timing(np.array(steps), np.array(batches), np.array(plans), env.num_agents, raised)
 
 
 def time_plans(env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int]) -> FloatArray:
     """Return the times of the first calls alone [s], of a policy for all agents together."""
-    times = []
+    loop = WorldsLoop(env, policy)
+    times: list[float] = []
     for seed in seeds:
         with Attempt():  # as above
-            rows, _ = env.reset(seed=[seed])
-            times.append(act(policy, env, rows, None, first=True).seconds)
+            loop.begin([seed])
+            loop.decide()
+            times += loop.step_times
     return np.array(times)
 
 
-@dataclass(frozen=True)
-class _WorldTimes:
-    """Times of the calls of one world for all agents, and for one alone."""
-
-    batches: list[float]
-    alone: list[float]
-
-
-def _time_world(
-    env: SpacecraftVectorEnv, policy: Policy, seed: int, alone: int | None, times: _WorldTimes
-) -> None:
-    reseed(policy, seed)
-    rows, _ = env.reset(seed=[seed])
-    state: Any = None
+def _time_world(loop: WorldsLoop, seed: int, alone: int | None, times: list[float]) -> None:
+    """Fly a world, and time the calls for one of its agents alone."""
     own_state: Any = None
-    for step in range(env.settings.steps):
-        first = step == 0
-        action, state, seconds = act(policy, env, rows, state, first)
-        times.batches.append(seconds)
+    loop.begin([seed])
+    while not loop.over:
+        loop.decide()
         if alone is not None:
-            row = rows[alone : alone + 1]
-            _, own_state, seconds = ask(policy, row, own_state, [first], (1, THRUSTERS))
-            times.alone.append(seconds)
-        rows, _, terminated, truncated, _ = env.step(action)
-        if (terminated | truncated).any():
-            return
+            row = loop.observation[alone : alone + 1]
+            first = [loop.step == 0]
+            _, own_state, seconds = ask(loop.policy, row, own_state, first, (1, THRUSTERS))
+            times.append(seconds)
+        loop.move()

@@ -7,17 +7,15 @@ did in its worst flight is the open-loop sequence that is kept and replayed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_benchmarks.run.flying import Attempt, reseed
+from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.library import Policy
-from lagros_benchmarks.tasks.spacecraft.episodes import act, bare, is_global, plans_of
-from lagros_envs.conventions import beyond_the_end
+from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, bare, is_global
 from lagros_envs.disturbances import Situation, onto_unit_sphere
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
@@ -201,13 +199,13 @@ class SpacecraftTarget:
         self, points: FloatArray, pushes: FloatArray | None = None
     ) -> SpacecraftFlights:
         """Fly one world per adversary, points (worlds, `PARAMETERS`); `pushes` as for `fly`."""
-        env = self.environment(1, "none")
-        rows, _ = env.reset(seed=[self.seed])
-        scenario = env.scenarios[0]
+        loop = WorldsLoop(self.environment(1, "none"), self.policy)
+        loop.begin([self.seed])
+        scenario = loop.env.scenarios[0]
         assert scenario is not None
-        state = act(self.policy, env, rows, None, True).state
-        nominal = _nominal_of(state, env)
-        adversary = Adversary(points, scenario, nominal, env.settings.control_period)
+        loop.decide()
+        nominal = None if loop.nominal is None else loop.nominal[0]
+        adversary = Adversary(points, scenario, nominal, loop.env.settings.control_period)
         return self.fly(self.environment(len(points), adversary), pushes)
 
     def fly(self, env: SpacecraftVectorEnv, pushes: FloatArray | None = None) -> SpacecraftFlights:
@@ -219,34 +217,27 @@ class SpacecraftTarget:
                 how far the worlds came where the policy raises.
         """
         shape = (env.num_worlds, self.agents)
-        rows, info = env.reset(seed=[self.seed] * shape[0])
-        scene = env.scenarios[0]
-        assert scene is not None
-        steps = env.settings.steps
+        loop = WorldsLoop(env, self.policy, past_the_end=True)
         if pushes is None:
-            pushes = np.zeros((shape[0], steps, self.agents, task.STATE_DIM))
-        reseed(self.policy, self.seed)
+            pushes = np.zeros((shape[0], env.settings.steps, self.agents, task.STATE_DIM))
         # The start belongs to the scenario, not to the policy.
-        gap = np.full(shape[0], np.inf)
-        misses = info["goal_distance"].reshape(shape) - env.settings.goal_radius
+        gap, misses = np.full(shape[0], np.inf), np.full(shape, np.inf)
         error: FloatArray | None = None
-        state: Any = None
-        nominal: FloatArray | None = None
-        for step in range(steps):
-            action, state, _ = act(self.policy, env, rows, state, step == 0)
-            if step == 0:
-                nominal = _nominal_of(state, env)
-                error = None if nominal is None else np.zeros(shape)
-            with beyond_the_end():
-                rows, _, _, _, info = env.step(action)
-            pushes[:, step] = info["disturbance"].reshape(*shape, task.STATE_DIM)
+        for _ in loop.fly([self.seed] * shape[0]):
+            info, scene = loop.info, env.scenarios[0]
+            assert scene is not None
+            miss = info["goal_distance"].reshape(shape) - env.settings.goal_radius
+            if loop.step == 0:
+                misses = miss
+                continue
+            pushes[:, loop.step - 1] = info["disturbance"].reshape(*shape, task.STATE_DIM)
             gap = np.minimum(gap, least_gap(env.states[..., :2], scene))
             whole = ~info["collided"].reshape(shape)
-            miss = info["goal_distance"].reshape(shape) - env.settings.goal_radius
             misses = np.where(whole, np.minimum(misses, miss), misses)
-            if nominal is not None and error is not None:
-                away = env.states[..., :2] - nominal[step + 1, :, :2]
-                error = np.maximum(error, np.linalg.norm(away, axis=-1))
+            if loop.nominal is not None:
+                away = env.states[..., :2] - loop.nominal[:, loop.step, :, :2]
+                distance = np.linalg.norm(away, axis=-1)
+                error = np.maximum(0.0 if error is None else error, distance)
         error = np.full(shape, np.nan) if error is None else error
         return SpacecraftFlights(
             self._scores(gap, misses, error),
@@ -256,7 +247,7 @@ class SpacecraftTarget:
             error,
             {
                 name: np.asarray(value).reshape(*shape, *value.shape[1:])
-                for name, value in info.items()
+                for name, value in loop.info.items()
             },
         )
 
@@ -326,15 +317,6 @@ def remember_plans(policy: Policy) -> None:
     planner = getattr(inner, "planner", None)
     if planner is not None and is_global(inner) and not isinstance(planner, PlansOnce):
         inner.planner = PlansOnce(planner)
-
-
-def _nominal_of(state: Any, env: SpacecraftVectorEnv) -> FloatArray | None:
-    """Return x_d of the scenario from a policy's memory, (steps + 1, agents, 6), or None."""
-    plans: Sequence[Any] | None = plans_of(state)
-    wanted = (env.settings.steps + 1, env.num_agents, task.STATE_DIM)
-    if plans is None or np.shape(plans[0].nominal) != wanted:
-        return None
-    return np.asarray(plans[0].nominal)
 
 
 def _unit(vectors: FloatArray) -> FloatArray:

@@ -1,0 +1,148 @@
+"""The closed loop of a policy and its environment, in which every command flies its episodes.
+
+    loop = ClosedLoop(env, policy)
+    for _ in loop.fly(seed):            # once for every control instant, the first one too
+        print(loop.step, loop.info["goal_distance"])
+
+What the loop holds is whole even where the next call raises. Whoever needs to look between the
+decision and what comes of it calls `begin`, `decide` and `move` in the place of `fly`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
+from typing import Any
+
+import numpy as np
+
+from lagros_benchmarks.run.flying import ask, counted, rehearse, reseed
+from lagros_benchmarks.run.library import Policy
+from lagros_envs.conventions import beyond_the_end
+
+
+class ClosedLoop:
+    """A policy in a Gymnasium environment, of one body or of a batch that does not reset itself.
+
+    Args:
+        env: The environment; a batch has a row per body in observations and actions.
+        policy: The policy.
+        past_the_end: Whether what has ended flies on to the time limit. Otherwise it stands in a
+            batch with the action zero until the others have ended, too.
+
+    Attributes:
+        step: Control steps that were taken.
+        observation: What the environment showed last.
+        action: What the policy decided last; None before.
+        memory: The policy's memory; None before the first decision.
+        reward: Of the last step.
+        terminated: Whether the last step ended the episode, each of a batch.
+        truncated: Whether it reached the time limit, likewise.
+        ended: Whether any step has done so, likewise.
+        info: The environment's, at this instant.
+        step_times: Time of every decision [s].
+    """
+
+    step: int
+    observation: Any
+    action: Any
+    memory: Any
+    reward: Any
+    terminated: Any
+    truncated: Any
+    ended: Any
+    info: dict[str, Any]
+    step_times: list[float]
+
+    def __init__(self, env: Any, policy: Policy, past_the_end: bool = False) -> None:
+        """Nothing flies yet."""
+        self.env, self.policy = env, policy
+        self._past_the_end = past_the_end
+        self._seed: Any = None
+        self._clear()
+
+    def fly(self, seed: Any, options: dict[str, Any] | None = None) -> Iterator[ClosedLoop]:
+        """Fly an episode, or a batch of them, to the end; yield at every control instant.
+
+        Args:
+            seed: Seed of the episode; a list of seeds for a batch.
+            options: Those of the environment's `reset`.
+        """
+        self.begin(seed, options)
+        yield self
+        while not self.over:
+            self.decide()
+            self.move()
+            yield self
+
+    def begin(self, seed: Any, options: dict[str, Any] | None = None) -> None:
+        """Reset the environment; see `fly` for the arguments."""
+        self._clear()
+        self._seed = seed
+        self.observation, self.info = self.env.reset(seed=seed, options=options)
+        if np.ndim(self.observation) > 1:
+            self.ended = np.zeros(len(self.observation), bool)
+
+    def decide(self) -> None:
+        """Ask the policy for its action; what it draws comes from the stream of the first seed."""
+        if self.step == 0:
+            reseed(self.policy, self._seed if np.ndim(self._seed) == 0 else self._seed[0])
+        seen = self.seen()
+        starts = _starts(seen, self.step == 0)
+        self.action, self.memory, seconds = ask(
+            self.policy, seen, self.memory, starts, *self.shapes()
+        )
+        self.step_times.append(seconds)
+
+    def move(self) -> None:
+        """Hold the action for one control step."""
+        if not self._past_the_end and np.ndim(self.ended):
+            self.action[self.ended] = 0.0
+        with beyond_the_end() if self._past_the_end else nullcontext():
+            self.observation, self.reward, self.terminated, self.truncated, self.info = (
+                self.env.step(self.action)
+            )
+        self.ended = self.ended | self.terminated | self.truncated
+        self.step += 1
+
+    @property
+    def over(self) -> bool:
+        """Whether all that flies has ended, or is at the time limit where it flies on."""
+        return bool(np.all(self.truncated if self._past_the_end else self.ended))
+
+    def counters(self) -> dict[str, int]:
+        """Return what the policy has counted."""
+        return counted(self.policy, self.memory)
+
+    def rehearse(self, what: str, seed: Any = 0, options: dict[str, Any] | None = None) -> None:
+        """Ask the policy once before it flies; see `flying.rehearse`.
+
+        Args:
+            what: What to call it in a message.
+            seed: As for `fly`.
+            options: As for `fly`.
+
+        Raises:
+            SetupError: It cannot run.
+        """
+        self.begin(seed, options)
+        seen = self.seen()
+        rehearse(what, self.policy, seen, _starts(seen, True), *self.shapes())
+
+    def seen(self) -> Any:
+        """Return what the policy is fed now."""
+        return self.observation
+
+    def shapes(self) -> Sequence[tuple[int, ...]]:
+        """Return the shapes that its action may have; it is taken in the first."""
+        return (self.env.action_space.shape,)
+
+    def _clear(self) -> None:
+        self.step, self.reward = 0, 0.0
+        self.observation = self.action = self.memory = None
+        self.terminated = self.truncated = self.ended = False
+        self.info, self.step_times = {}, []
+
+
+def _starts(seen: Any, first: bool) -> Any:
+    return [first] if np.ndim(seen) == 1 else np.full(len(seen), first)
