@@ -21,11 +21,12 @@ there is a planner, but neither u* nor a tube.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,11 @@ from lagros_envs.checks import (
     check_positive,
 )
 from lagros_envs.dynamics.system import System
+from lagros_envs.numbers.functions import where
 from lagros_envs.values import ByValue, use_plain_numbers
+
+if TYPE_CHECKING:
+    from lagros_envs.draw import Renderer
 
 FloatArray = NDArray[np.float64]
 Numbers = tuple[float, ...]
@@ -48,6 +53,15 @@ LARGEST_DISTANCE = 1e12
 # No control is larger, whatever the action: the effort of an episode stays a number, in single
 # precision as well.
 LARGEST_CONTROL = 1e16
+
+
+def distance_between(first: Sequence[Any], second: Sequence[Any], functions: Any) -> Any:
+    """Return the Euclidean norm of a difference from the parts of both (any kind of number)."""
+    total: Any = None
+    for one, other in zip(first, second, strict=True):
+        off = one - other
+        total = off * off if total is None else total + off * off
+    return functions.sqrt(total)
 
 
 def _no_discs() -> FloatArray:
@@ -71,6 +85,32 @@ class Scenario(ByValue):
     def __post_init__(self) -> None:
         """Make the arrays read-only."""
         self._lock()
+
+
+class Layout:
+    """Where each named part of an observation lies, along its last axis.
+
+    Attributes:
+        state: x.
+        goal: x_f.
+        initial_state: x(0).
+        time: t [s].
+        discs: Centre and radius of each disc, one after the other; zeros where there is none.
+        size: Numbers in an observation.
+    """
+
+    def __init__(self, states: int, discs: int) -> None:
+        """Lay out so many states and discs."""
+        self.state, self.goal = slice(0, states), slice(states, 2 * states)
+        self.initial_state = slice(2 * states, 3 * states)
+        self.time = 3 * states
+        self.size = self.time + 1 + 3 * discs
+        self.discs = slice(self.time + 1, self.size)
+
+    def discs_of(self, observation: NDArray[Any]) -> FloatArray:
+        """Return the discs in observations (..., size), shape (..., most discs, 3)."""
+        rows = np.asarray(observation[..., self.discs], np.float64)
+        return rows.reshape(*rows.shape[:-1], -1, 3)
 
 
 @dataclass(frozen=True)
@@ -223,6 +263,10 @@ class Task(Described):
         body_radius: Of the body around its position [m].
         most_discs: Discs that an observation has room for.
         margin: Room that a plan keeps beside body and disc [m].
+        short_goal: Coordinates that a goal may be given by alone, the others being zero.
+        alive_bonus: Reward per second of an episode that goes on, so that ending early never pays.
+        distance_weight: Reward per (unit of distance from the goal) s, negative sign applied.
+        success_bonus: Reward at the first success.
         metric: The contraction metric; None for none.
         feedback: What u* prefers, and the weights of the regulators; None for Bryson's rule.
         learning: How its networks are made; None for none.
@@ -245,10 +289,15 @@ class Task(Described):
     body_radius: ClassVar[float] = 0.0
     most_discs: ClassVar[int] = 0
     margin: ClassVar[float] = 0.0
+    short_goal: ClassVar[tuple[int, ...]] = ()
     metric: ClassVar[MetricDesign | None] = None
     feedback: ClassVar[Feedback | None] = None
     learning: ClassVar[Learning | None] = None
     weights: ClassVar[Path | None] = None
+    # Without an annotation: a task may make fields of them.
+    alive_bonus = 10.0
+    distance_weight = 1.0
+    success_bonus = 10.0
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -284,15 +333,74 @@ class Task(Described):
         """Largest u, shape (m,)."""
         return (math.inf,) * self.system.control_dim
 
+    def control(self, action: FloatArray) -> FloatArray:
+        """Return u of actions (..., m), as the environment applies it."""
+        with np.errstate(over="ignore"):
+            moved = np.add(self.control_centre, np.multiply(self.control_scale, action))
+        most = np.minimum(self.control_high, LARGEST_CONTROL)
+        return np.clip(moved, np.maximum(self.control_low, -LARGEST_CONTROL), most)
+
+    def action(self, control: FloatArray) -> FloatArray:
+        """Return the action of controls (..., m)."""
+        off = np.subtract(control, self.control_centre)
+        action: FloatArray = off / np.array(self.control_scale)
+        return action
+
+    @property
+    def effort_weight(self) -> float:
+        """Reward per control^2 s of effort, negative sign applied.
+
+        By default the largest action costs as much as a second of the episode brings.
+        """
+        return self.alive_bonus / sum(scale * scale for scale in self.control_scale)
+
+    @property
+    def layout(self) -> Layout:
+        """Where each named part of an observation lies."""
+        return Layout(self.system.state_dim, self.most_discs)
+
     def sample(self, rng: np.random.Generator) -> Scenario:
         """Draw what an episode asks for."""
         raise NotImplementedError(f"{type(self).__name__}.sample(rng) must return a Scenario")
 
     def sample_many(self, rng: np.random.Generator, count: int) -> Scenario:
-        """Draw several at once; to be overridden where that is faster."""
-        drawn = [self.sample(rng) for _ in range(count)]
-        parts = [(one.initial_state, one.goal, one.discs) for one in drawn]
-        return Scenario(*(np.stack(part) for part in zip(*parts, strict=True)))
+        """Draw the scenarios of several episodes, one after the other, from one generator."""
+        return self.sample_each(itertools.repeat(rng, count))
+
+    def sample_each(self, generators: Iterable[np.random.Generator]) -> Scenario:
+        """Draw one scenario from each generator; both may be overridden by what is faster.
+
+        Returns:
+            All of them, with a leading axis; discs that are missing are rows of zeros.
+        """
+        drawn = [self.sample(rng) for rng in generators]
+        n = self.system.state_dim
+        return Scenario(
+            np.array([one.initial_state for one in drawn], np.float64).reshape(-1, n),
+            np.array([one.goal for one in drawn], np.float64).reshape(-1, n),
+            np.array([self.all_discs(one.discs) for one in drawn]).reshape(-1, self.most_discs, 3),
+        )
+
+    def all_discs(self, discs: FloatArray) -> FloatArray:
+        """Return discs (..., k, 3) with rows of zeros for those that are missing."""
+        padded = np.zeros((*discs.shape[:-2], self.most_discs, 3))
+        padded[..., : discs.shape[-2], :] = discs
+        return padded
+
+    def renderer(self, render_mode: str, fps: int) -> Renderer:
+        """Return what draws the environment.
+
+        Args:
+            render_mode: "human" or "rgb_array".
+            fps: Frames per second at which "human" plays.
+        """
+        from lagros_envs.draw import PlaneRenderer
+
+        return PlaneRenderer(self, render_mode, fps)
+
+    def outline(self, state: FloatArray) -> Sequence[FloatArray]:
+        """Return the body as closed polygons (corners, 2) [m], for its picture; () for a disc."""
+        return ()
 
     def success_radius(self, time: Any) -> Any:
         """Return how near the goal counts as success at a time [s] (a float or an array)."""
@@ -305,19 +413,47 @@ class Task(Described):
     def goal_distance(self, state: Sequence[Any], goal: Sequence[Any], functions: Any) -> Any:
         """Return the distance from the goal: of the positions, or of the states without one."""
         which = self.position or range(self.system.state_dim)
-        total: Any = 0.0
-        for index in which:
-            off = state[index] - goal[index]
-            total = total + off * off
-        return functions.sqrt(total)
+        here, there = ([values[index] for index in which] for values in (state, goal))
+        return distance_between(here, there, functions)
 
     def excess(self, state: Sequence[Any], functions: Any) -> Any:
         """Return by how much the state is beyond what the task allows; positive: it has fallen.
 
-        A search for the worst disturbance follows its slope.
+        Written like an equation of motion, but it may also choose by `numbers.functions.where`. A
+        search for the worst disturbance follows its slope.
         """
         return 0.0 * state[0] - 1.0
 
     def fallen(self, state: Sequence[Any], functions: Any) -> Any:
-        """Return whether the state has left what the task allows, which ends the episode."""
+        """Return whether the state has left what the task allows, which ends the episode.
+
+        One comparison or several by `<=` and `>`, each in parentheses of its own, joined by `&`
+        and `|`.
+        """
         return self.excess(state, functions) > 0.0
+
+    def fallen_start(self, states: FloatArray) -> str:
+        """Say what is wrong with initial states (..., n) of which some have fallen."""
+        return f"holds a state in which the episode of {self.name} has already ended"
+
+    def reward(self, effort: Any, distance: Any, first_success: Any, down: Any) -> Any:
+        """Return the reward of one control step (floats, arrays or recorded numbers).
+
+        Args:
+            effort: ||u - centre||^2 dt of the step [control^2 s].
+            distance: From the goal, after the step.
+            first_success: Whether the step brought the first success.
+            down: Whether the body has fallen or collided.
+
+        Returns:
+            -w_e ||u - centre||^2 dt - w_d distance dt + b_a dt [not down] + b_s [first success].
+            The distance counts as at most b_a / w_d, so that a step more never costs more than
+            ending the episode.
+        """
+        reach = self.alive_bonus - self.distance_weight * distance
+        stay = self.control_period * (0.5 * (reach + abs(reach)))
+        return (
+            -self.effort_weight * effort
+            + where(down, 0.0, stay)
+            + where(first_success, self.success_bonus, 0.0)
+        )

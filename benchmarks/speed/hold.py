@@ -50,10 +50,11 @@ def _floats(scale: Scale) -> list[Row]:
     candidates: dict[str, Candidate] = {
         "called": lambda _: rk4_hold(system, state, control, push, _DURATION, math)
     }
+    grouped = tuple(state), tuple(control), tuple(push)
     ways = {"recorded": False} | ({"compiled": True} if _NUMBA else {})
     for name, compiled in ways.items():
         run = HeldStep(system, _DURATION, compiled).run
-        candidates[name] = lambda _, run=run: run(*numbers)
+        candidates[name] = lambda _, run=run: run(*grouped)
     return _rows("cart-pole, floats", candidates, scale)
 
 

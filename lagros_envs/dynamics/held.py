@@ -21,9 +21,8 @@ from lagros_envs.dynamics.straight_line import (
 from lagros_envs.dynamics.system import System
 
 FloatArray = NDArray[np.float64]
-# From the parts of x, u, d and what is given, as floats, to those of x at the end and what is
-# measured there.
-FloatStep = Callable[..., tuple[float, ...]]
+# From x, u, d and what is given, tuples of floats, to x at the end and what is measured there.
+FloatStep = Callable[..., tuple[tuple[float, ...], tuple[Any, ...]]]
 
 
 class HeldStep:
@@ -38,9 +37,9 @@ class HeldStep:
         pushed: Whether there is a disturbance; it costs a tenth of the step.
 
     Attributes:
-        run: From the n parts of x, the m of u, the n of d (if there is one) and what is given to
-            the n of x at the end and what the measure computed. It raises ValueError for the sine
-            of an infinity, or returns nan where it is compiled.
+        run: From x, u, d (if there is one) and what is given (if anything is), each a tuple of
+            floats, to x at the end and what the measure computed. It raises ValueError for the
+            sine of an infinity, or returns nan where it is compiled.
 
     Raises:
         ValueError: `compiled` is none of these.
@@ -185,7 +184,7 @@ def _float_step(
 ) -> FloatStep:
     tail = None if measure is None else recorded_measure(system, measure, given)
     step = recorded_hold(system, duration / SUBSTEPS, 1, pushed=pushed)
-    source = scalar_source(step, SUBSTEPS, tail)
+    source = scalar_source(step, SUBSTEPS, tail, grouped=True)
     if compiled:
         from lagros_envs.dynamics.compiled import compiled_function
 

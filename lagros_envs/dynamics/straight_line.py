@@ -9,6 +9,7 @@ is reordered, so that every result has the bits that calling the function would 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +36,7 @@ _UFUNCS: dict[str, Any] = {
     "<=": np.less_equal,
     ">": np.greater,
     "&": np.logical_and,
+    "|": np.logical_or,
     "where": lambda condition, yes, no, out: np.copyto(out, np.where(condition, yes, no)),
 }
 # What the sources that are written here begin with.
@@ -156,13 +158,20 @@ def recorded_measure(
     )
 
 
-def scalar_source(step: StraightLine, repeats: int, tail: StraightLine | None = None) -> str:
+def scalar_source(
+    step: StraightLine,
+    repeats: int,
+    tail: StraightLine | None = None,
+    grouped: bool = False,
+) -> str:
     """Return a module in Python that feeds the outputs to the first inputs, repeatedly.
 
     Args:
         step: What is repeated; it has no more outputs than inputs.
         repeats: How often.
         tail: What is computed at the end, from inputs of the step and from others.
+        grouped: Whether `held` takes one sequence for the inputs of each first letter, which is
+            quicker than many arguments, and returns two tuples.
 
     Returns:
         Source of a function `held` of the inputs, those of the step first, as floats, that returns
@@ -172,15 +181,23 @@ def scalar_source(step: StraightLine, repeats: int, tail: StraightLine | None = 
     fed = ", ".join(step.inputs[: len(outputs)])
     ending, measured = statements(tail) if tail is not None else ([], [])
     others = [name for name in tail.inputs if name not in step.inputs] if tail is not None else []
+    arguments, unpacked = [*step.inputs, *others], []
+    result = ", ".join([fed, *measured])
+    if grouped:
+        groups = {letter: list(names) for letter, names in groupby(arguments, lambda one: one[0])}
+        unpacked = [f"{', '.join(names)}, = {letter}" for letter, names in groups.items()]
+        arguments = list(groups)
+        result = f"({fed},), ({''.join(f'{one}, ' for one in measured)})"
     return "\n".join(
         [
             IMPORTS,
             "",
-            f"def held({', '.join([*step.inputs, *others])}):",
+            f"def held({', '.join(arguments)}):",
+            *(f"    {line}" for line in unpacked),
             # Written out: a loop in Python costs as much as a few operations.
             *[f"    {line}" for line in [*lines, f"{fed} = {', '.join(outputs)}"]] * repeats,
             *(f"    {line}" for line in ending),
-            f"    return {', '.join([fed, *measured])}",
+            f"    return {result}",
             "",
         ]
     )

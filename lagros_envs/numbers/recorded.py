@@ -13,7 +13,7 @@ class Operation(NamedTuple):
 
     Attributes:
         symbol: `+`, `-`, `*`, `/`, `sin`, `cos`, `tan`, `exp`, `sqrt`, `abs`; or, of rules, `<=`,
-            `>` and `&`, which are 1 where they hold and 0 elsewhere, and `where`.
+            `>`, `&` and `|`, which are 1 where they hold and 0 elsewhere, and `where`.
         operands: Names of inputs, results, or the text of a constant.
     """
 
@@ -122,6 +122,10 @@ class Recorded:
     def __and__(self, other: Any) -> Recorded:
         """Record whether both of two comparisons hold."""
         return self.tape.record("&", self, other)
+
+    def __or__(self, other: Any) -> Recorded:
+        """Record whether at least one of two comparisons holds."""
+        return self.tape.record("|", self, other)
 
     def where(self, yes: Any, no: Any) -> Recorded:
         """Record the choice between two numbers, by this comparison."""

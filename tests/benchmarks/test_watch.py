@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from lagros_benchmarks.commands import cli
 from lagros_benchmarks.report import video, watched
-from lagros_benchmarks.report.pictures import CartPolePictures
+from lagros_benchmarks.report.pictures import SinglePictures
 from lagros_benchmarks.report.playback import Playback, WatchSettings
 from lagros_envs import spacecraft_v0
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
@@ -207,7 +207,7 @@ def test_the_picture_between_two_control_instants_is_where_the_cart_pole_is():
 
     halves, whole = cartpole(0.05), cartpole(0.1)
     halves.step(np.array([0.3]))
-    pictures = CartPolePictures(whole, "rgb_array", 10.0)
+    pictures = SinglePictures(whole, "rgb_array", 10.0)
     pictures.hold(np.array([0.3]))
     whole.step(np.array([0.3]))
     np.testing.assert_array_equal(pictures.draw(0.5, np.zeros(4)), halves.render())

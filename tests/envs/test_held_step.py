@@ -16,8 +16,9 @@ from lagros_envs.dynamics import compiled, hold_step
 from lagros_envs.dynamics.held import HeldBatch, HeldStep, has_numba
 from lagros_envs.dynamics.integrate import rk4_hold
 from lagros_envs.dynamics.straight_line import ArrayFunction, straight_line
-from lagros_envs.tasks.cartpole import task
+from lagros_envs.rules import StepRules
 from lagros_envs.tasks.cartpole.physics import CartPole
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.spacecraft.physics import Spacecraft
 
 ODD = CartPole(cart_mass=2.3, pole_mass=0.4, half_length=0.7, cart_friction=0.0)
@@ -46,7 +47,8 @@ def test_a_step_on_floats_is_the_integrator_bit_for_bit(system, compiled):
     run = HeldStep(system, 0.1, compiled).run
     for state, control, push in zip(*numbers(system, 40), strict=True):
         expected = rk4_hold(system, state.tolist(), control.tolist(), push.tolist(), 0.1, math)
-        assert run(*state.tolist(), *control.tolist(), *push.tolist()) == tuple(expected)
+        found, measured = run(*(tuple(part.tolist()) for part in (state, control, push)))
+        assert (found, measured) == (tuple(expected), ())
 
 
 @pytest.mark.parametrize("substeps", [1, 3, 4])
@@ -113,14 +115,14 @@ def moments(count, seed=1):
 
 @pytest.mark.parametrize("compiled", BACKENDS)
 def test_rules_on_floats_are_their_function_bit_for_bit(compiled):
-    rules = task.StepRules(task.CartPoleSettings(system=ODD))
-    run = HeldStep(ODD, 0.1, compiled, measure=rules, given=rules.GIVEN).run
+    rules = StepRules(CartPoleSettings(system=ODD))
+    run = HeldStep(ODD, 0.1, compiled, measure=rules, given=rules.given).run
     for state, control, push, given in zip(*numbers(ODD, 40), moments(40).T, strict=True):
         end = rk4_hold(ODD, state.tolist(), control.tolist(), push.tolist(), 0.1, math)
-        expected = (*end, *rules(end, control.tolist(), given.tolist(), math))
-        found = run(*state.tolist(), *control.tolist(), *push.tolist(), *given.tolist())
+        expected = tuple(end), tuple(rules(end, control.tolist(), given.tolist(), math))
+        found = run(*(tuple(part.tolist()) for part in (state, control, push, given)))
         assert found == expected
-        assert [type(value) for value in found[-2:]] == [bool, bool]
+        assert [type(value) for value in found[1][-2:]] == [bool, bool]
 
 
 @needs_numba
@@ -137,11 +139,11 @@ def test_blocks_that_are_not_full_change_nothing(worlds):
 @pytest.mark.parametrize("compiled", BACKENDS)
 def test_the_rules_judge_the_state_at_the_end(compiled):
     """Against the rules written out, world by world."""
-    settings = task.CartPoleSettings(system=ODD, effort_weight=0.3, distance_weight=2.0)
-    rules = task.StepRules(settings)
+    settings = CartPoleSettings(system=ODD, effort_weight=0.3, distance_weight=2.0)
+    rules = StepRules(settings)
     state, force, push = numbers(ODD, 300)
     given = moments(300)
-    hold = HeldBatch(ODD, 0.1, (300,), compiled, measure=rules, given=rules.GIVEN)
+    hold = HeldBatch(ODD, 0.1, (300,), compiled, measure=rules, given=rules.given)
     end = hold(state.T, force.T, push.T, given).T
     seen = set()
     for world, x in enumerate(end):
@@ -151,7 +153,7 @@ def test_the_rules_judge_the_state_at_the_end(compiled):
         inside = distance <= radius and not fallen
         first = inside and math.isinf(success_time)
         seen.add((fallen, inside, math.isinf(success_time)))
-        reward = task.reward(settings, spent, distance, bool(first), bool(fallen))
+        reward = settings.reward(spent, distance, bool(first), bool(fallen))
         expected = [
             effort + spent,
             effort + spent if math.isinf(success_time) else frozen,
@@ -168,10 +170,10 @@ def test_the_rules_judge_the_state_at_the_end(compiled):
 @pytest.mark.parametrize("first", [False, True])
 @pytest.mark.parametrize("fallen", [False, True])
 def test_a_reward_is_what_its_page_says(first, fallen):
-    settings = task.CartPoleSettings(upright_bonus=7.0, success_bonus=5.0)
+    settings = CartPoleSettings(upright_bonus=7.0, success_bonus=5.0)
     expected = -0.01 * 3.0 + 0.1 * (7.0 - 2.0) * (not fallen) + 5.0 * first
-    assert task.reward(settings, 3.0, 2.0, first, fallen) == pytest.approx(expected)
-    arrays = task.reward(settings, 3.0, np.array([2.0]), np.array([first]), np.array([fallen]))
+    assert settings.reward(3.0, 2.0, first, fallen) == pytest.approx(expected)
+    arrays = settings.reward(3.0, np.array([2.0]), np.array([first]), np.array([fallen]))
     assert arrays == pytest.approx(expected)
 
 
@@ -183,7 +185,7 @@ def test_steps_survive_a_pickle(compiled):
     copied = pickle.loads(pickle.dumps(hold))
     np.testing.assert_array_equal(copied(state.T, control.T, push.T), expected)
     step = HeldStep(ODD, 0.1, compiled)
-    arguments = [*state[0].tolist(), *control[0].tolist(), *push[0].tolist()]
+    arguments = [tuple(part[0].tolist()) for part in (state, control, push)]
     assert pickle.loads(pickle.dumps(step)).run(*arguments) == step.run(*arguments)
 
 
@@ -216,8 +218,8 @@ def test_no_push_is_a_push_of_zero_bit_for_bit(compiled):
     expected = pushed(state.T, control.T, zeros.T)
     np.testing.assert_allclose(calm(state.T, control.T), expected, rtol=tolerance, atol=tolerance)
     runs = [HeldStep(ODD, 0.1, compiled, pushed=flag).run for flag in (True, False)]
-    for x, u in zip(state.tolist(), control.tolist(), strict=True):
-        assert runs[0](*x, *u, 0.0, 0.0, 0.0, 0.0) == runs[1](*x, *u)
+    for x, u in zip(map(tuple, state.tolist()), map(tuple, control.tolist()), strict=True):
+        assert runs[0](x, u, (0.0,) * 4) == runs[1](x, u)
 
 
 @pytest.mark.parametrize(

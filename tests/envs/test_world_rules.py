@@ -8,8 +8,9 @@ import pytest
 
 import lagros_envs  # noqa: F401  registers the environment
 from lagros_envs.dynamics.held import HeldBatch
+from lagros_envs.rules import StepRules
 from lagros_envs.sweep import Path, swept_agents
-from lagros_envs.tasks.cartpole.task import CartPoleSettings, StepRules
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 
@@ -61,7 +62,7 @@ def test_a_world_whose_agents_have_all_collided_starts_anew_and_alone():
 def test_a_pickled_batch_measures_what_the_original_does():
     settings = CartPoleSettings()
     rules = StepRules(settings)
-    batch = HeldBatch(settings.system, 0.1, (3,), False, measure=rules, given=rules.GIVEN)
+    batch = HeldBatch(settings.system, 0.1, (3,), False, measure=rules, given=rules.given)
     rng = np.random.default_rng(0)
     inputs = rng.normal(size=(4, 3)), rng.normal(size=(1, 3)), np.zeros((4, 3)), np.ones((9, 3))
     again = pickle.loads(pickle.dumps(batch))

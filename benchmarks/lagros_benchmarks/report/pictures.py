@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.report.video import Frame
+from lagros_envs.draw import Frame as Scene
 from lagros_envs.dynamics import hold_step
-from lagros_envs.tasks.cartpole.task import applied_force
 
 FloatArray = NDArray[np.float64]
 
 
-class CartPolePictures:
-    """Draws a cart-pole, also between two control instants.
+class SinglePictures:
+    """Draws a task of one body, also between two control instants.
 
     Args:
         env: The environment, unwrapped; somebody else resets it and takes its steps.
@@ -29,24 +29,22 @@ class CartPolePictures:
 
     def __init__(self, env: Any, render_mode: str, rate: float) -> None:
         """Open the window, or what draws without one."""
-        from lagros_envs.tasks.cartpole.draw import CartPoleRenderer
-
         self._env = env
-        self._renderer = CartPoleRenderer(render_mode, max(1, round(rate)))
+        self._renderer = env.settings.renderer(render_mode, max(1, round(rate)))
         self._begun: FloatArray = env.state
-        self._force = np.zeros(1)
+        self._control = np.array(env.settings.control_centre)
 
     def hold(self, action: FloatArray) -> None:
-        """Remember where the next control step begins, and the force that is held in it."""
+        """Remember where the next control step begins, and the control that is held in it."""
         self._begun = self._env.state
-        self._force = np.asarray(applied_force(self._env.settings, action, np.clip), np.float64)
+        self._control = self._env.settings.control(np.asarray(action, np.float64))
 
     def draw(self, part: float, disturbance: FloatArray) -> Frame | None:
         """Draw where a part of the last control step has led.
 
         Args:
             part: Of the step, in (0, 1]; 1 is its end.
-            disturbance: d that was held in it, shape (4,).
+            disturbance: d that was held in it, shape (n,).
 
         Returns:
             The frame, or None in a window.
@@ -57,17 +55,20 @@ class CartPolePictures:
         if part < 1.0:
             # What the environment does in the whole step, for a part of it.
             span = part * task.control_period
-            state = hold_step(task.system, self._begun, self._force, span, disturbance)
-        return self._renderer.draw(
-            state=state,
-            goal=env.scenario.goal,
-            tube_radius=task.tube.radius(steps * task.control_period),
-            disturbance=disturbance,
-            disturbance_bound=env.disturbance.bound,
-            nominal=None if env.nominal is None else _between(env.nominal, steps),
-            time=steps * task.control_period,
-            half_length=task.system.half_length,
+            state = hold_step(task.system, self._begun, self._control, span, disturbance)
+        frame: Frame | None = self._renderer.draw(
+            Scene(
+                state=state,
+                goal=env.scenario.goal,
+                discs=env.scenario.discs,
+                tube_radius=float(task.success_radius(steps * task.control_period)),
+                disturbance=disturbance,
+                disturbance_bound=env.disturbance.bound,
+                nominal=None if env.nominal is None else _between(env.nominal, steps),
+                time=steps * task.control_period,
+            )
         )
+        return frame
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 import lagros_envs  # noqa: F401  (registers the environments)
-from lagros_benchmarks.report.pictures import CartPolePictures, SpacecraftPictures
+from lagros_benchmarks.report.pictures import SinglePictures, SpacecraftPictures
 from lagros_benchmarks.report.video import Frame
 from lagros_benchmarks.run import library
 from lagros_benchmarks.run.episodes import ACTION
@@ -54,7 +54,7 @@ class CartPoleGame:
         options = {"nominal": np.asarray(plan.states)} if plan.solved else {}
         self._observation, self._info = self.env.reset(seed=self._seed, options=options)
         # Only now: a window would stand still while this plans.
-        self._pictures = CartPolePictures(self.env, render_mode, rate)
+        self._pictures = SinglePictures(self.env, render_mode, rate)
 
     def step(self) -> bool:
         """Take a control step; return whether the episode is over."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,10 @@ from lagros_envs.canvas import (
     Point,
     mix,
 )
+from lagros_envs.draw import Frame
+
+if TYPE_CHECKING:
+    from lagros_envs.tasks.cartpole.task import CartPoleSettings
 
 FloatArray = NDArray[np.float64]
 
@@ -47,6 +52,7 @@ class CartPoleRenderer(Canvas):
     travels. Only the mode "human" opens a window; "rgb_array" needs no display.
 
     Args:
+        task: The task.
         render_mode: "human" or "rgb_array".
         fps: Frames per second at which "human" plays.
 
@@ -54,39 +60,26 @@ class CartPoleRenderer(Canvas):
         ImportError: pygame is not installed.
     """
 
-    def __init__(self, render_mode: str, fps: int) -> None:
+    def __init__(self, task: CartPoleSettings, render_mode: str, fps: int) -> None:
         """Prepare a canvas, and a window in the mode "human"."""
-        super().__init__(render_mode, fps, (WIDTH, HEIGHT), "lagros/CartPole-v0", (17, 20))
+        super().__init__(render_mode, fps, (WIDTH, HEIGHT), task.env_id, (17, 20))
+        self._half_length = task.system.half_length
         # (t, distance to the goal, radius) of the frames of this episode.
         self._history: list[tuple[float, float, float]] = []
 
-    def draw(
-        self,
-        *,
-        state: FloatArray,
-        goal: FloatArray,
-        tube_radius: float,
-        disturbance: FloatArray,
-        disturbance_bound: float,
-        nominal: FloatArray | None,
-        time: float,
-        half_length: float,
-    ) -> NDArray[np.uint8] | None:
+    def draw(self, frame: Frame) -> NDArray[np.uint8] | None:
         """Draw one frame.
-
-        Args:
-            state: x, shape (4,).
-            goal: x_f, shape (4,).
-            tube_radius: r(t), the success threshold.
-            disturbance: d of the last step, shape (4,).
-            disturbance_bound: d_bar, the scale of the arrows.
-            nominal: x_d at this time, shape (4,), drawn as a ghost; None without a plan.
-            time: t [s].
-            half_length: l, from the hinge to the middle of the pole [m].
 
         Returns:
             The frame, shape (400, 800, 3), in the mode "rgb_array"; None in the mode "human".
         """
+        state, goal, nominal, tube_radius = (
+            frame.state,
+            frame.goal,
+            frame.nominal,
+            frame.tube_radius,
+        )
+        half_length, time = self._half_length, frame.time
         left, right = sorted((float(state[0]), float(goal[0])))
         apart = right - left
         self._span = max(
@@ -106,9 +99,9 @@ class CartPoleRenderer(Canvas):
         if nominal is not None:
             self._draw_cart_pole(nominal, half_length, PURPLE, ghost=True)
         self._draw_cart_pole(state, half_length, BLUE, ghost=False)
-        share = disturbance / disturbance_bound if disturbance_bound > 0.0 else np.zeros(4)
-        self._draw_disturbance(state, share, half_length)
-        self._draw_legend(time, distance, tube_radius, disturbance_bound, nominal is not None)
+        self._draw_disturbance(state, frame.share, half_length)
+        bound = frame.disturbance_bound
+        self._draw_legend(time, distance, tube_radius, bound, nominal is not None)
         self._draw_plot(time, distance, tube_radius)
         return self._shown()
 

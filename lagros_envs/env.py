@@ -1,0 +1,461 @@
+"""The environment of any task of one body: bring it to a goal, under bounded disturbance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from lagros_envs.conventions import (
+    RENDER_MODES,
+    Conforming,
+    End,
+    check_render_mode,
+    check_started,
+    plain_seed,
+    warned_after,
+)
+from lagros_envs.disturbances import Situation
+from lagros_envs.draw import Frame
+from lagros_envs.dynamics.held import HeldStep
+from lagros_envs.numbers import functions
+from lagros_envs.of_task import (
+    Channels,
+    OfTask,
+    action_space,
+    actuators,
+    contacts,
+    disturbance_of,
+    meaning_of,
+    named_space,
+    option_names,
+    scenario_with,
+    stated_nominal,
+    stated_scenario,
+)
+from lagros_envs.options import checked_actions, known_options
+from lagros_envs.rules import StepRules
+from lagros_envs.seeding import SharedStreams, episode_streams
+from lagros_envs.stepwise import StepwiseDisturbance
+from lagros_envs.task import LARGEST_DISTANCE, Scenario, Task, distance_between
+
+FloatArray = NDArray[np.float64]
+
+_READY = 64  # starts that are drawn in advance
+
+
+class _Start(NamedTuple):
+    """How an episode begins.
+
+    Attributes:
+        state: x(0).
+        goal: x_f.
+        discs: Centre and radius of each, shape (most_discs, 3).
+        fixed: What the rules of a step are given of the episode: the discs, then the goal.
+        blank: The observation but for state and time, not to be written to.
+    """
+
+    state: tuple[float, ...]
+    goal: tuple[float, ...]
+    discs: FloatArray
+    fixed: tuple[float, ...]
+    blank: NDArray[np.float32]
+
+
+class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One body with n states and m controls, held for a control step, and a bounded disturbance.
+
+    ## Action
+    `Box(-1, 1, (m,))`: u = `task.control_centre` + `task.control_scale` * action. Actions beyond
+    +-1 are applied as they are, as far as `task.control_low` and `task.control_high` let them.
+
+    ## Observation
+    A flat float32 vector; `gymnasium.spaces.unflatten(env.unwrapped.named_space, obs)` names its
+    parts, and `task.layout` says where they lie: `state` x, `goal` x_f and `initial_state` x(0),
+    n each, `time` t [s], and, where the task has discs, `discs` (most_discs, 3), centre and radius
+    of each [m], zeros where there is none.
+
+    ## Dynamics
+    dx/dt = f(x) + B(x) u + d, Runge-Kutta in four substeps, u and d held over the control step,
+    ||d|| <= `disturbance_bound`.
+
+    ## Reward
+    `task.reward`: minus effort and distance to the goal, plus a bonus for every step that the
+    episode goes on and one for the first success.
+
+    ## Starting state
+    `task.sample`. `reset(options=...)` takes `initial_state`, `goal`, `nominal` (x_d at every
+    control instant, shape (steps + 1, n)) and, where the task has discs, `discs` (k, 3). A reset
+    that is refused leaves the environment as it was.
+
+    ## Episode end
+    `terminated` when the body has fallen (`task.fallen`; so is a control too large to integrate,
+    which leaves the state as it was) or touches a disc on the straight way between two control
+    instants; `truncated` at `task.time_limit`. The episode goes on after success.
+    `gym.make(..., max_episode_steps=20)` ends episodes sooner; longer ones need a longer
+    `settings.time_limit` and a `max_episode_steps` to match.
+
+    ## Info
+    `success` (at some control instant so far the goal was within `tube_radius`, and no disc has
+    been touched), `is_success` (the same, by the name that other libraries read), `success_time`
+    [s] (of the first such instant; inf before), `inside_tube` (within it at this instant),
+    `fallen`, `collided` (where the task has discs), `effort` (the integral of ||u - centre||^2 so
+    far), `effort_to_success` (the same, frozen at the first success), `disturbance` (d of the
+    step), `tube_radius` (`task.success_radius`), `goal_distance` and, where the episode has a
+    nominal, `tracking_error`, the distance from it.
+
+    Args:
+        disturbance: Kind of disturbance, one of `lagros_envs.disturbances.KINDS`, or a function of
+            a `Situation`.
+        disturbance_bound: d_bar, in units of the state per second; None for that of the task.
+        disturbance_channels: "all", "rates", or a mask of the n states.
+        metric: Contraction metric M for the kind "worst": (n, n), or a function of the state.
+        settings: The task with settings of its own, or a dictionary of those fields that differ
+            from the defaults.
+        compiled: Whether numba (the extra "fast") compiles the equation of motion; the trajectories
+            stay the same, bit for bit.
+        render_mode: None, "human" or "rgb_array".
+        task: The task, or the name that it is registered by.
+
+    Raises:
+        ValueError: A setting is not valid.
+        ImportError: `compiled` was asked for and numba is not installed.
+    """
+
+    settings: Task
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}
+
+    def __init__(
+        self,
+        disturbance: str | Any = "none",
+        disturbance_bound: float | None = None,
+        disturbance_channels: Channels = "all",
+        metric: Any = None,
+        settings: Task | Mapping[str, Any] | None = None,
+        compiled: bool = False,
+        render_mode: str | None = None,
+        task: Task | str | None = None,
+    ) -> None:
+        """Build the environment; see the class for the arguments."""
+        self.render_mode = check_render_mode(render_mode)
+        self.settings = self._settings(task, settings)
+        self.disturbance = disturbance_of(
+            self.settings, disturbance, disturbance_bound, disturbance_channels, metric
+        )
+        self._feedback = self.disturbance.is_feedback
+        self._calm = self.disturbance.kind == "none"
+        self._rules = StepRules(self.settings)
+        self._discs = bool(self.settings.most_discs)
+        self._hold = HeldStep(
+            self.settings.system,
+            self.settings.control_period,
+            compiled,
+            measure=self._rules,
+            given=self._rules.given,
+            pushed=not self._calm,
+        )
+        self._steps = self.settings.steps
+        # t and the radius of success at every control instant.
+        self._clock = [self._instant(step) for step in range(self._steps + 1)]
+        # Drawn in advance if the episode has a seed of its own.
+        self._pushes: FloatArray | None = None
+        self._stepwise = StepwiseDisturbance(self.disturbance, 1, self.settings.control_period)
+        self._shared: SharedStreams | None = None
+        # Starts that are drawn in advance, the next one last: to draw many takes little longer than
+        # to draw one.
+        self._ready: list[_Start] = []
+        self._layout = self.settings.layout
+        self.named_space = named_space(self.settings)
+        self.observation_space = cast(
+            "spaces.Space[NDArray[np.float32]]", spaces.flatten_space(self.named_space)
+        )
+        self.action_space = cast("spaces.Space[NDArray[np.float32]]", action_space(self.settings))
+        # Where an outcome has reward and fall, and what says that it is one.
+        names = self._rules.names
+        self._end_at = slice(names.index("reward"), names.index("inside"))
+        self._size = names.index("size" if "size" in names else "distance")
+        self._actuators = list(zip(*actuators(self.settings), strict=True))
+        self._renderer: Any = None
+        self._started = False
+        self.nominal: FloatArray | None = None
+        self._end = End.NOT_YET
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seed of the episode; the scenario and the disturbance have a stream each. None
+                goes on drawing from the generator that the last seed has left.
+            options: `initial_state` (n,), `goal` (n,), `nominal` (steps + 1, n), `discs` (k, 3).
+
+        Returns:
+            The observation and the info.
+
+        Raises:
+            ValueError: The seed is none, or an option is unknown or has a wrong shape or value.
+        """
+        options = known_options(options, option_names(self.settings))
+        given = stated_scenario(options, self.settings) if options else {}
+        nominal = stated_nominal(options, self.settings) if options else None
+        if self.disturbance.kind == "worst" and nominal is None:
+            n = self.settings.system.state_dim
+            raise ValueError(
+                'disturbance="worst" needs the nominal trajectory of the episode: pass '
+                f'reset(options={{"nominal": array of shape (steps + 1, {n})}})'
+            )
+        seed = plain_seed(seed)
+        super().reset(seed=seed)
+        start = self._draw(seed)
+        if given:
+            start = self._starts(scenario_with(_scenario(start), given))[0]
+        self._start, self.nominal = start, nominal
+        self._state, self._goal, _, self._fixed, self._blank = start
+        self._step = 0
+        self._now = self._clock[0]
+        self._outcome = self._first_outcome()
+        self._push = np.zeros(self.settings.system.state_dim)
+        self._started = True
+        self._end = End.NOT_YET
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), self._info()
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Hold the control for one control step.
+
+        Args:
+            action: Controls in units of `task.control_scale` from `task.control_centre`, (m,).
+
+        Returns:
+            Observation, reward, terminated, truncated, info.
+
+        Raises:
+            ValueError: The action is not m finite numbers.
+            RuntimeError: The environment was not reset.
+        """
+        check_started(self._started, "step()")
+        control = self._control(action)
+        if self._end is not End.NOT_YET:
+            self._end = warned_after(self._end)
+        self._push = self._current_push()
+        step = self._step = self._step + 1
+        self._now = self._clock[step] if step <= self._steps else self._instant(step)
+        self._advance(control)
+        reward, over = self._outcome[self._end_at]
+        if self._discs:
+            over = over or self._outcome[0] > 0.0
+        if self.render_mode == "human":
+            self.render()
+        truncated = step >= self._steps
+        if (over or truncated) and self._end is End.NOT_YET:
+            self._end = End.REACHED
+        return self._observation(), reward, over, truncated, self._info()
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of the episode."""
+        check_started(self._started, "scenario")
+        found = _scenario(self._start)
+        return Scenario(found.initial_state, found.goal, found.discs[found.discs[:, 2] > 0.0])
+
+    @property
+    def state(self) -> FloatArray:
+        """The state x in double precision, shape (n,)."""
+        check_started(self._started, "state")
+        return np.array(self._state)
+
+    @property
+    def time(self) -> float:
+        """The time t [s]."""
+        check_started(self._started, "time")
+        return self._step * self.settings.control_period
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the scene: an RGB array, or a window in the mode "human"."""
+        if self.render_mode is None:
+            gym.logger.warn(
+                "render() was called without a render mode; "
+                'pass render_mode="rgb_array" to gym.make'
+            )
+            return None
+        check_started(self._started, "render()")
+        if self._renderer is None:
+            self._renderer = self.settings.renderer(self.render_mode, self.metadata["render_fps"])
+        scenario = self.scenario
+        nominal = None if self.nominal is None else self.nominal[self._nominal_index()]
+        frame: NDArray[np.uint8] | None = self._renderer.draw(
+            Frame(
+                state=self.state,
+                goal=scenario.goal,
+                discs=scenario.discs,
+                tube_radius=self._now[1],
+                disturbance=self._push,
+                disturbance_bound=self.disturbance.bound,
+                nominal=nominal,
+                time=self.time,
+            )
+        )
+        return frame
+
+    def close(self) -> None:
+        """Release the window."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _draw(self, seed: int | None) -> _Start:
+        """Draw the disturbance of an episode and return its start."""
+        disturbed = not self._calm
+        if seed is not None:
+            streams = episode_streams(seed)
+            if disturbed:
+                self._pushes = self.disturbance.realise(
+                    streams.disturbance, self._steps, self.settings.control_period
+                )
+            return self._starts(self.settings.sample(streams.scenario))[0]
+        if self._shared is None or self._shared.source is not self.np_random:
+            self._shared, self._ready = SharedStreams(self.np_random), []
+        if disturbed:
+            # Not in advance: an episode of a learner may end after a few steps.
+            self._pushes = None
+            self._stepwise.begin(np.zeros(1, np.intp), self._shared.disturbance)
+        if not self._ready:
+            drawn = self.settings.sample_many(self._shared.scenario, _READY)
+            self._ready = self._starts(drawn)[::-1]
+        return self._ready.pop()
+
+    def _starts(self, scenarios: Scenario) -> list[_Start]:
+        """Return the starts of one scenario or of several."""
+        states, goals = np.atleast_2d(scenarios.initial_state, scenarios.goal)
+        discs = self.settings.all_discs(scenarios.discs).reshape(len(states), -1, 3)
+        blanks = np.zeros((len(states), self._layout.size), np.float32)
+        blanks[:, self._layout.goal], blanks[:, self._layout.initial_state] = goals, states
+        blanks[:, self._layout.discs] = discs.reshape(len(states), -1)
+        fixed = np.concatenate([contacts(self.settings, discs), goals], axis=1)
+        first, second, last = (map(tuple, part.tolist()) for part in (states, goals, fixed))
+        return [_Start(*one) for one in zip(first, second, discs, last, blanks, strict=True)]
+
+    def _control(self, action: NDArray[np.float32]) -> tuple[float, ...]:
+        known = type(action) is np.ndarray and action.dtype.char in "fd"
+        known = known and action.shape == (len(self._actuators),)
+        values = action.tolist() if known else [math.nan]
+        if not math.isfinite(sum(values)):
+            # Slower, and with a message.
+            shape = (len(self._actuators),)
+            values = checked_actions(action, shape, meaning_of(self.settings)).tolist()
+        control = []
+        for value, (centre, scale, low, high) in zip(values, self._actuators, strict=True):
+            one = centre + scale * value
+            # Comparisons: calling min and max takes three times as long.
+            control.append(one if low <= one <= high else high if one > high else low)
+        return tuple(control)
+
+    def _given(self) -> tuple[float, ...]:
+        """Return what the rules are given of this step, see `rules.Given`."""
+        if self._discs:
+            x, y = self.settings.position
+            start = self._state[x], self._state[y]
+            return (*start, *self._fixed, *self._now, *self._outcome[:4])
+        return (*self._fixed, *self._now, *self._outcome[:3])
+
+    def _first_outcome(self) -> tuple[Any, ...]:
+        """Return what is known of an episode at its start: an `Outcome`, as far as it is kept."""
+        task = self.settings
+        distance = task.goal_distance(self._state, self._goal, functions)
+        inside = distance <= self._now[1] and not task.fallen(self._state, functions)
+        outcome = (0.0, 0.0, 0.0 if inside else math.inf, distance, 0.0, False, inside)
+        if not self._discs:
+            return outcome
+        place = [self._state[index] for index in task.position]
+        discs = [self._fixed[k : k + 3] for k in range(0, 3 * task.most_discs, 3)]
+        touching = self._rules.touching(place, place, discs)
+        return (1.0 if touching else 0.0, *outcome)
+
+    def _advance(self, control: tuple[float, ...]) -> None:
+        """Move the state over one control step, whose end `_step` counts already, and judge it."""
+        given = self._given()
+        run = self._hold.run
+        try:
+            if self._calm:
+                state, outcome = run(self._state, control, given)
+            else:
+                state, outcome = run(self._state, control, tuple(self._push.tolist()), given)
+        except (OverflowError, ValueError):  # an infinity has no sine
+            pass
+        else:
+            # A comparison with nan is false.
+            if outcome[self._size] <= LARGEST_DISTANCE:
+                self._state, self._outcome = state, outcome
+                return
+        self._outcome = self._rules.lost(self._state, control, given, functions)
+
+    def _instant(self, step: int) -> tuple[float, float]:
+        time = step * self.settings.control_period
+        return time, float(self.settings.success_radius(time))
+
+    def _current_push(self) -> FloatArray:
+        if self._calm:
+            return np.zeros(self.settings.system.state_dim)
+        if self._pushes is None:
+            drawn = self._stepwise.step(self._step, cast(SharedStreams, self._shared).disturbance)[
+                :, 0
+            ]
+        else:
+            # Past the time limit (a caller who ignored `truncated`) the last push stays.
+            drawn = self._pushes[min(self._step, self._steps - 1)]
+        if not self._feedback:
+            return drawn
+        nominal = None if self.nominal is None else self.nominal[self._nominal_index()]
+        return self.disturbance.respond(
+            Situation(self.state, nominal, np.asarray(self.time), drawn)
+        )
+
+    def _nominal_index(self) -> int:
+        return min(self._step, self._steps)
+
+    def _observation(self) -> NDArray[np.float32]:
+        observation = self._blank.copy()
+        # One by one: a few floats become an array more slowly than they are stored.
+        for index, value in enumerate(self._state):
+            observation[index] = value
+        observation[self._layout.time] = self._now[0]
+        return observation
+
+    def _info(self) -> dict[str, Any]:
+        known = self._outcome[1:] if self._discs else self._outcome
+        effort, effort_to_success, success_time, distance, _, fallen, inside = known[:7]
+        success = success_time != math.inf
+        if self._discs:
+            collided = self._outcome[0] > 0.0
+            success = success and not collided
+        info = {
+            "success": success,
+            "is_success": success,
+            "success_time": success_time,
+            "inside_tube": inside,
+            "fallen": fallen,
+            "effort": effort,
+            "effort_to_success": effort_to_success,
+            "disturbance": self._push,
+            "tube_radius": self._now[1],
+            "goal_distance": distance,
+        }
+        if self._discs:
+            info["collided"] = collided
+        if self.nominal is not None:
+            nominal = self.nominal[self._nominal_index()].tolist()
+            info["tracking_error"] = distance_between(self._state, nominal, functions)
+        return info
+
+
+def _scenario(start: _Start) -> Scenario:
+    return Scenario(np.array(start.state), np.array(start.goal), start.discs)
