@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from lagros_envs.conventions import End, check_started, settings_of, warned_after
+from lagros_envs.conventions import (
+    Conforming,
+    End,
+    check_started,
+    plain_seed,
+    settings_of,
+    warned_after,
+)
 from lagros_envs.disturbances import Disturbance, channel_mask
 from lagros_envs.options import known_options
 from lagros_envs.seeding import episode_streams
@@ -156,13 +164,45 @@ class SpacecraftEpisode:
         check_started(self.started, what)
 
 
-class SpacecraftDrawing:
-    """Draws an episode; the renderer, and pygame with it, comes with the first frame."""
+class OneWorld(Conforming):
+    """An environment of one world: how its episodes begin, and its picture.
+
+    The renderer, and pygame with it, comes with the first frame.
+    """
 
     render_mode: str | None
     episode: SpacecraftEpisode
     metadata: dict[str, Any]
+    _np_random: np.random.Generator | None = None
+    _np_random_seed: int | None = None
     _renderer: Any = None
+
+    def _begin(self, seed: int | None, options: Mapping[str, Any] | None) -> None:
+        """Start the episode of a seed, or of the next draw; a reset that is refused does nothing.
+
+        Raises:
+            ValueError: The seed is none, or an option is unknown or has a wrong type, shape or
+                value.
+        """
+        given = self.episode.checked(options)
+        seed = plain_seed(seed)
+        if seed is not None or self._np_random is None:
+            self._np_random, self._np_random_seed = seeding.np_random(seed)
+        self.episode.start(int(self._np_random.integers(2**63)) if seed is None else seed, given)
+        if self.render_mode == "human":
+            self.render()
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of the episode."""
+        self.episode.need_start("scenario")
+        return cast(Scenario, self.episode.world.scenarios[0])
+
+    @property
+    def time(self) -> float:
+        """The time t [s]."""
+        self.episode.need_start("time")
+        return float(self.episode.world.time[0])
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene: an RGB array, or a window in the mode "human"."""

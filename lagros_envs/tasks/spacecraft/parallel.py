@@ -7,27 +7,24 @@ from typing import Any, Literal, cast
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from pettingzoo.utils.env_logger import EnvLogger
 
 from lagros_envs.conventions import (
     RENDER_MODES,
-    Conforming,
     check_render_mode,
-    plain_seed,
     settings_of,
 )
 from lagros_envs.options import checked_actions
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.episode import (
-    SpacecraftDrawing,
+    OneWorld,
     SpacecraftEpisode,
     action_space,
     one_info,
 )
-from lagros_envs.tasks.spacecraft.scenarios import Preset, Scenario
+from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import global_state, named_state_space, observe
 
 FloatArray = NDArray[np.float64]
@@ -36,9 +33,7 @@ Float32Array = NDArray[np.float32]
 _OF_CHECKERS = {"options": 1}
 
 
-class SpacecraftParallelEnv(
-    SpacecraftDrawing, Conforming, ParallelEnv[str, Float32Array, Float32Array]
-):
+class SpacecraftParallelEnv(OneWorld, ParallelEnv[str, Float32Array, Float32Array]):
     """Spacecraft that seek their goals among obstacles and each other, under bounded disturbance.
 
     ## Action
@@ -163,7 +158,6 @@ class SpacecraftParallelEnv(
             agent: cast("spaces.Space[Float32Array]", action_space())
             for agent in self.possible_agents
         }
-        self._np_random: np.random.Generator | None = None
 
     def observation_space(self, agent: str) -> spaces.Space[Float32Array]:
         """Return the observation space of an agent."""
@@ -189,14 +183,8 @@ class SpacecraftParallelEnv(
             ValueError: The seed is none, or an option is unknown or has a wrong type, shape or
                 value.
         """
-        given = self.episode.checked(None if options == _OF_CHECKERS else options)
-        seed = plain_seed(seed)
-        if seed is not None or self._np_random is None:
-            self._np_random, _ = seeding.np_random(seed)
-        self.episode.start(int(self._np_random.integers(2**63)) if seed is None else seed, given)
+        self._begin(seed, None if options == _OF_CHECKERS else options)
         self.agents = self.possible_agents[:]
-        if self.render_mode == "human":
-            self.render()
         return self._observations(), self._infos()
 
     def step(
@@ -254,18 +242,6 @@ class SpacecraftParallelEnv(
         """The states x of all agents in double precision, shape (agents, 6)."""
         self.episode.need_start("states")
         return cast(FloatArray, self.episode.world.states[0])
-
-    @property
-    def scenario(self) -> Scenario:
-        """The scenario of the episode."""
-        self.episode.need_start("scenario")
-        return cast(Scenario, self.episode.world.scenarios[0])
-
-    @property
-    def time(self) -> float:
-        """The time t [s]."""
-        self.episode.need_start("time")
-        return float(self.episode.world.time[0])
 
     def _known(self, agent: str) -> str:
         if agent not in self.action_spaces:

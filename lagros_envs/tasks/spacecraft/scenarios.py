@@ -22,6 +22,7 @@ from lagros_envs.checks import (
 )
 from lagros_envs.conventions import built_like
 from lagros_envs.files import write_atomic
+from lagros_envs.options import real_numbers
 from lagros_envs.reading import Record
 from lagros_envs.tasks.spacecraft.placement import clear, most_apart, scatter, scatter_pairs
 from lagros_envs.tasks.spacecraft.reachable import way_exists
@@ -36,6 +37,14 @@ ATTEMPTS = 1000  # of a whole scenario, before the density is called impossible
 LARGEST = 1e4
 MOST_AGENTS, MOST_OBSTACLES = 1000, 10_000  # all pairs of them are looked at
 GRID = 0.15  # cell of the grid on which a way is looked for [m]
+# Shapes of a scenario's arrays, for n agents and k obstacles.
+_SHAPES: dict[str, tuple[Any, ...]] = {
+    "starts": ("n", 2),
+    "headings": ("n",),
+    "goals": ("n", 2),
+    "obstacles": ("k", 2),
+    "obstacle_radii": ("k",),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,18 +76,10 @@ class Scenario(ByValue):
 
     def __post_init__(self) -> None:
         """Take read-only copies in double precision and check them."""
-        names = ("starts", "headings", "goals", "obstacles", "obstacle_radii")
-        arrays = {name: _numbers(name, getattr(self, name)) for name in names}
-        agents, obstacles = arrays["starts"].shape[:1], arrays["obstacle_radii"].shape[:1]
-        shapes = {
-            "starts": (*agents, 2),
-            "headings": agents,
-            "goals": (*agents, 2),
-            "obstacles": (*obstacles, 2),
-            "obstacle_radii": obstacles,
-        }
-        for name, shape in shapes.items():
-            value = arrays[name]
+        arrays = {name: _numbers(name, getattr(self, name)) for name in _SHAPES}
+        sizes = {"n": arrays["starts"].shape[:1], "k": arrays["obstacle_radii"].shape[:1]}
+        for name, (whose, *rest) in _SHAPES.items():
+            value, shape = arrays[name], (*sizes[whose], *rest)
             if value.size == 0:
                 value = value.reshape(shape if 0 in shape else value.shape)
             if value.shape != shape or not np.all(np.abs(value) <= LARGEST):
@@ -166,11 +167,7 @@ class Scenario(ByValue):
         core = record["core_radius"]
         try:
             return cls(
-                starts=record.array("starts", (None, 2)),
-                headings=record.array("headings", (None,)),
-                goals=record.array("goals", (None, 2)),
-                obstacles=record.array("obstacles", (None, 2)),
-                obstacle_radii=record.array("obstacle_radii", (None,)),
+                **{name: record.array(name, (None, *rest)) for name, (_, *rest) in _SHAPES.items()},
                 agent_radius=record.number("agent_radius"),
                 core_radius=None if core is None else record.number("core_radius"),
             )
@@ -180,18 +177,11 @@ class Scenario(ByValue):
 
 
 def _numbers(name: str, value: Any) -> FloatArray:
-    """Return a copy of an array of real numbers.
-
-    Raises:
-        ValueError: It is no such array.
-    """
-    try:
-        array = np.array(value)
-    except ValueError:
-        array = np.array(None)
-    if array.dtype.kind not in "fiu":
+    """Return a copy of an array of real numbers, or refuse what is none."""
+    array = real_numbers(value)
+    if array is None:
         raise ValueError(f"{name}={shown(value)} must be numbers in lists of equal lengths")
-    return array.astype(np.float64)
+    return array
 
 
 @dataclass(frozen=True)

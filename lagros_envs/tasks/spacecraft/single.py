@@ -10,23 +10,23 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lagros_envs.conventions import RENDER_MODES, Conforming, check_render_mode, plain_seed
+from lagros_envs.conventions import RENDER_MODES, check_render_mode
 from lagros_envs.options import checked_actions, real_numbers
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.episode import (
-    SpacecraftDrawing,
+    OneWorld,
     SpacecraftEpisode,
     action_space,
     one_info,
 )
-from lagros_envs.tasks.spacecraft.scenarios import Preset, Scenario
+from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import observe
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
 
-class SpacecraftEnv(SpacecraftDrawing, Conforming, gym.Env[Float32Array, Float32Array]):
+class SpacecraftEnv(OneWorld, gym.Env[Float32Array, Float32Array]):
     """One spacecraft that seeks its goal among obstacles, under bounded disturbance.
 
     The world, action, observation, reward and info of `spacecraft.SpacecraftParallelEnv` with a
@@ -92,12 +92,7 @@ class SpacecraftEnv(SpacecraftDrawing, Conforming, gym.Env[Float32Array, Float32
             ValueError: The seed is none, or an option is unknown or has a wrong type, shape or
                 value.
         """
-        given = self.episode.checked(_with_agents(options))
-        seed = plain_seed(seed)
-        super().reset(seed=seed)
-        self.episode.start(int(self.np_random.integers(2**63)) if seed is None else seed, given)
-        if self.render_mode == "human":
-            self.render()
+        self._begin(seed, _with_agents(options))
         return self._observation(), self._info()
 
     def step(self, action: Float32Array) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
@@ -131,18 +126,6 @@ class SpacecraftEnv(SpacecraftDrawing, Conforming, gym.Env[Float32Array, Float32
         """The state x in double precision, shape (6,)."""
         self.episode.need_start("state")
         return cast(FloatArray, self.episode.world.states[0, 0])
-
-    @property
-    def scenario(self) -> Scenario:
-        """The scenario of the episode."""
-        self.episode.need_start("scenario")
-        return cast(Scenario, self.episode.world.scenarios[0])
-
-    @property
-    def time(self) -> float:
-        """The time t [s]."""
-        self.episode.need_start("time")
-        return float(self.episode.world.time[0])
 
     def _observation(self) -> Float32Array:
         return cast(Float32Array, observe(self.episode.world, self.episode.layout)[0, 0])
