@@ -1,23 +1,15 @@
 """Environments with bounded disturbance; importing this package registers their ids.
 
-`gym.make("lagros/CartPole-v0")` and `gym.make_vec("lagros/CartPole-v0", num_envs=1024)`; the same
-for "lagros/Spacecraft-v0", whose multi-agent form is `lagros_envs.spacecraft_v0.parallel_env()`.
+`gym.make("lagros/TITLE-v0")` and `gym.make_vec("lagros/TITLE-v0", num_envs=1024)` for each task in
+`lagros_envs.tasks`, and for a `Task` of your own after `register_task(task)`.
 """
 
-from gymnasium.envs.registration import register
+from lagros_envs.registry import find_task, register_env, register_task
+from lagros_envs.task import Scenario, Task
+from lagros_envs.tasks import SHIPPED
 
 __version__ = "0.1.0"
+__all__ = ["Scenario", "Task", "find_task", "register_task"]
 
-register(
-    id="lagros/CartPole-v0",
-    entry_point="lagros_envs.tasks.cartpole.env:CartPoleEnv",
-    vector_entry_point="lagros_envs.tasks.cartpole.vector:CartPoleVectorEnv",
-    max_episode_steps=90,  # of the default settings, as below; the environment itself truncates
-)
-
-register(
-    id="lagros/Spacecraft-v0",
-    entry_point="lagros_envs.tasks.spacecraft.single:SpacecraftEnv",
-    vector_entry_point="lagros_envs.tasks.spacecraft.vector:SpacecraftVectorEnv",
-    max_episode_steps=450,
-)
+for _name, _shipped in SHIPPED.items():
+    register_env(_name, _shipped)

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import importlib
+import os
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import gymnasium as gym
 
 from lagros_envs.checks import shown, suggestion
-from lagros_envs.task import Described
-from lagros_envs.tasks import SHIPPED
+from lagros_envs.task import Described, Task
+from lagros_envs.tasks import SHIPPED, Shipped
 
-_REGISTERED: dict[str, Described] = {}
+ENTRY_POINTS = "lagros.tasks"  # the group in which an installed package names its tasks
+_FOUND: dict[str, Described] = {}
 
 
 def task_names() -> tuple[str, ...]:
     """Return the names of all tasks that are known by name."""
-    return (*SHIPPED, *(name for name in _REGISTERED if name not in SHIPPED))
+    return (*SHIPPED, *(name for name in _FOUND if name not in SHIPPED))
 
 
 def task_named(name: str) -> Described:
@@ -25,12 +32,174 @@ def task_named(name: str) -> Described:
     Raises:
         ValueError: There is no such task.
     """
-    if name not in _REGISTERED:
+    if name not in _FOUND:
         if not isinstance(name, str) or name not in SHIPPED:
             names = task_names()
             raise ValueError(
                 f"unknown task {shown(name)}.{suggestion(name, names)} Valid: {', '.join(names)}."
             )
-        module, _, attribute = SHIPPED[name].partition(":")
-        _REGISTERED[name] = getattr(importlib.import_module(module), attribute)()
-    return _REGISTERED[name]
+        module, _, attribute = SHIPPED[name].task.partition(":")
+        _FOUND[name] = getattr(importlib.import_module(module), attribute)()
+    return _FOUND[name]
+
+
+def find_task(text: str) -> Described:
+    """Return a task by what a user calls it, and register it.
+
+    Args:
+        text: A name; one in the entry-point group `lagros.tasks` of an installed package;
+            "module:attribute"; or the path of a file, "./car.py", or of one with an attribute,
+            "./car.py:Car". The file is run. In it the task is `task`, or else the only task.
+
+    Raises:
+        ValueError: There is no such task, or something is wrong with it.
+    """
+    from importlib.metadata import entry_points
+
+    if text in task_names():
+        return task_named(text)
+    for point in entry_points(group=ENTRY_POINTS, name=text):
+        return _registered(_made(_loaded(point.value), f"the entry point {text!r}"))
+    place, colon, attribute = text.rpartition(":")
+    if not colon or os.sep in attribute or attribute.endswith(".py"):
+        place, attribute = text, ""
+    if place.endswith(".py") or os.sep in place:
+        from lagros_envs.from_file import imported
+
+        module = imported(Path(place))
+        found = getattr(module, attribute, None) if attribute else _only_task(module, place)
+        if found is None:
+            raise ValueError(f"{place} has no attribute {attribute}")
+        return _registered(_made(found, text))
+    if attribute:
+        return _registered(_made(_loaded(text), text))
+    names = (*task_names(), *entry_points(group=ENTRY_POINTS).names)
+    raise ValueError(
+        f"unknown task {shown(text)}.{suggestion(text, names)} Valid: {', '.join(names)}; "
+        'the path of a file with a task, such as "./car.py"; or "module:attribute"'
+    )
+
+
+def register_task(task: Task) -> Task:
+    """Check a task and register it with Gymnasium, under its `env_id`.
+
+    Args:
+        task: With its default settings.
+
+    Returns:
+        The same.
+
+    Raises:
+        TypeError: It is no `Task`, or its system lacks something.
+        ValueError: Something is wrong with it, or another task has its name; the message says
+            what.
+    """
+    from lagros_envs.check_task import check_task
+
+    check_task(task)
+    for name, known in _FOUND.items():
+        # A file that is read again, or a cell of a notebook, makes the same class anew.
+        same = type(known).__qualname__ == type(task).__qualname__
+        same = same and _origin(known) == _origin(task)
+        if (name == task.name or known.title == task.title) and not same:
+            raise ValueError(
+                f"name={task.name!r}, title={task.title!r} are those of another task, "
+                f"{type(known).__qualname__} of {_origin(known)}; choose others"
+            )
+    for name, shipped in SHIPPED.items():
+        if (name == task.name) != (shipped.title == task.title) or (
+            name == task.name and type(task) is not type(task_named(name))
+        ):
+            raise ValueError(
+                f"name={task.name!r}, title={task.title!r} are taken by the task {name!r} of this "
+                "package; choose others"
+            )
+    _FOUND[task.name] = task
+    if task.name not in SHIPPED:
+        register_env(task.name, Shipped("", task.title, task.steps))
+    return task
+
+
+def register_env(name: str, shipped: Shipped) -> None:
+    """Register environment and vector form of a task with Gymnasium."""
+    env_id = f"lagros/{shipped.title}-v0"
+    gym.registry.pop(env_id, None)
+    general = shipped.env == Shipped._field_defaults["env"]
+    gym.register(
+        id=env_id,
+        entry_point=shipped.env,
+        vector_entry_point=shipped.vector,
+        max_episode_steps=shipped.steps,
+        kwargs={"task": name} if general else {},
+    )
+
+
+def _origin(task: Described) -> str:
+    return type(task).__module__
+
+
+def _registered(task: Described) -> Described:
+    if task.name in _FOUND and _FOUND[task.name] is task:
+        return task
+    return register_task(task) if isinstance(task, Task) else task
+
+
+def _loaded(text: str) -> Any:
+    """Import module:attribute."""
+    name, _, attribute = text.partition(":")
+    try:
+        found: Any = importlib.import_module(name)
+        for part in attribute.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(
+            f"{text}: {error}. A module is looked for on Python's path; name a file by its path, "
+            'such as "./car.py"'
+        ) from error
+    return found
+
+
+def _made(found: Any, text: str) -> Described:
+    """Return the task that something is, or that it makes."""
+    if (isinstance(found, type) and issubclass(found, Described)) or callable(found):
+        try:
+            found = found()
+        except Exception as error:
+            raise ValueError(
+                f"{text}: {getattr(found, '__name__', shown(found))}() makes no task: "
+                f"{type(error).__name__}: {error}"
+            ) from error
+    if not isinstance(found, Described):
+        raise ValueError(
+            f"{text} is {shown(found)}; it must be a Task, a subclass that can be made without "
+            "arguments, or a function that returns one"
+        )
+    return found
+
+
+def _only_task(module: ModuleType, place: str) -> Any:
+    """Return `task` of a module, or the only task that it makes or defines."""
+    if hasattr(module, "task"):
+        return module.task
+    own = {
+        name: value
+        for name, value in vars(module).items()
+        if isinstance(value, Task)
+        or (isinstance(value, type) and issubclass(value, Task) and _is_own(value, module))
+    }
+    made = {name: value for name, value in own.items() if isinstance(value, Task)} or own
+    if len(made) == 1:
+        return next(iter(made.values()))
+    if not made:
+        raise ValueError(
+            f"{place} has no task: define a subclass of lagros_envs.Task in it, or an instance "
+            "called task"
+        )
+    raise ValueError(
+        f"{place} has several tasks, {', '.join(made)}; say which, for instance "
+        f'"{place}:{next(iter(made))}", or call one of them task'
+    )
+
+
+def _is_own(kind: type, module: ModuleType) -> bool:
+    return kind.__module__ == module.__name__

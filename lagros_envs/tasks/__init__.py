@@ -1,7 +1,39 @@
 """The tasks, a folder each; registration names them and nothing else does."""
 
-# Name of each shipped task, and where its settings are; imported when they are asked for.
+from typing import NamedTuple
+
+
+class Shipped(NamedTuple):
+    """A task of this package, as module:attribute each; imported when it is asked for.
+
+    Attributes:
+        task: What gives the task with its default settings.
+        title: As in `gym.make("lagros/TITLE-v0")`.
+        steps: Control steps of an episode of the default settings.
+        env: Its environment.
+        vector: Its vector form.
+    """
+
+    task: str
+    title: str
+    steps: int
+    env: str = "lagros_envs.env:TaskEnv"
+    vector: str = "lagros_envs.vector:TaskVectorEnv"
+
+
 SHIPPED = {
-    "cartpole": "lagros_envs.tasks.cartpole.task:CartPoleSettings",
-    "spacecraft": "lagros_envs.tasks.spacecraft.task:SpacecraftSettings",
+    "cartpole": Shipped(
+        "lagros_envs.tasks.cartpole.task:CartPoleSettings",
+        "CartPole",
+        90,
+        "lagros_envs.tasks.cartpole.env:CartPoleEnv",
+        "lagros_envs.tasks.cartpole.vector:CartPoleVectorEnv",
+    ),
+    "spacecraft": Shipped(
+        "lagros_envs.tasks.spacecraft.task:SpacecraftSettings",
+        "Spacecraft",
+        450,
+        "lagros_envs.tasks.spacecraft.single:SpacecraftEnv",
+        "lagros_envs.tasks.spacecraft.vector:SpacecraftVectorEnv",
+    ),
 }
