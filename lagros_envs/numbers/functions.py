@@ -43,14 +43,14 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
 
 def minimum(x: Any, limit: Any) -> Any:
     """Return the smaller of a number and a limit; NaN stays NaN. For features, not for physics."""
-    if isinstance(x, np.ndarray):
+    if isinstance(x, np.ndarray) or isinstance(limit, np.ndarray):
         return np.minimum(x, limit)
     return where(x > limit, limit, x)
 
 
 def maximum(x: Any, limit: Any) -> Any:
     """Return the larger of a number and a limit; NaN stays NaN. For features, not for physics."""
-    if isinstance(x, np.ndarray):
+    if isinstance(x, np.ndarray) or isinstance(limit, np.ndarray):
         return np.maximum(x, limit)
     return where(x <= limit, limit, x)
 

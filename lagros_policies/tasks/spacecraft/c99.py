@@ -103,10 +103,10 @@ def _constants(source: SpacecraftSource) -> str:
         "CRUISE": (CRUISE_SPEED, "mean speed that nobody has to exceed [m/s]"),
         "LEAST_TIME": (LEAST_TIME, "[s]"),
         "CLOSE": (
-            features.DISTANCES[1],
+            features.CLOSE,
             "distance beyond which one feature stays [m]",
         ),
-        "SOON": (features.TIMES[1], "time beyond which one feature stays [s]"),
+        "SOON": (features.SOON, "time beyond which one feature stays [s]"),
         "SMALL": (features.SMALL, "keeps divisors from zero [m]"),
         "MASS": (body.mass, "[kg]"),
         "TWICE_INERTIA": (2.0 * body.inertia, "[kg m^2]"),

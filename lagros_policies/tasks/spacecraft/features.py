@@ -3,14 +3,18 @@
 The task has no preferred direction. Vectors are turned into the frame whose first axis points to
 the goal, and what the network answers is turned back, so that no direction has to be learned. In
 that frame a plan depends on the body's heading not at all; heading and spin enter for the torque.
-Vectors are complex numbers here: a turn is one product.
+Vectors are complex numbers here: a turn is one product. The features themselves are functions over
+the kinds of number: of arrays for NumPy, of recorded numbers for `lagros export`.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.numbers.functions import exp, maximum, minimum
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.learning.deep_set import Elements, SetFeatures
 from lagros_policies.tasks.spacecraft.pace import time_to_go
@@ -44,10 +48,49 @@ NEIGHBOUR = (
 OBSTACLE = (*NEIGHBOUR, "distance of the centres at touch [m]")
 
 SMALL = 1e-9  # [m]
-DISTANCES = np.array([np.inf, 0.5])  # up to which the distance to the goal counts [m]
-TIMES = np.array([np.inf, 5.0])  # up to which the time to go counts [s]
+CLOSE, SOON = 0.5, 5.0  # up to which distance [m] and time to go [s] count once more
 NEAR = 0.3  # scale of nearness = exp(-gap / NEAR) [m]
 FADE = 0.4  # what is sensed counts in full this far inside the sensing radius [m]
+
+
+def own_features(goal: Any, velocity: Any, turn: Any, spin: Any, left: Any) -> tuple[Any, Any]:
+    """Return `OWN` and the unit vector to the goal.
+
+    Args:
+        goal: Relative to the agent, a vector [m].
+        velocity: A vector [m/s].
+        turn: Of the heading since the start [rad].
+        spin: [rad/s].
+        left: Until the horizon [s].
+    """
+    # A shift that no observation, in single precision, can undo: nothing is divided by zero.
+    shifted = goal + SMALL
+    distance = abs(shifted)
+    frame = shifted / distance
+    course = velocity * frame.conj()
+    time = time_to_go(distance, left)
+    near, soon = minimum(distance, CLOSE), minimum(time, SOON)
+    over = distance / (time + SOON)
+    return (distance, near, course.real, course.imag, time, soon, over, turn, spin), frame
+
+
+def body_features(apart: Any, motion: Any, touch: Any, rim: Any) -> tuple[Any, Any]:
+    """Return `OBSTACLE` of a body, all but the last of which are `NEIGHBOUR`, and its weight.
+
+    Args:
+        apart: Where it is, relative to the agent in the frame of the goal [m].
+        motion: How it moves, likewise [m/s].
+        touch: Distance of the centres at touch [m].
+        rim: Distance of the centres from which on it is not sensed [m].
+    """
+    centre = abs(apart) + SMALL
+    unit, gap = apart / centre, centre - touch
+    # Deep inside another body nearness would explode.
+    nearness = exp(maximum(gap, -NEAR) * (-1.0 / NEAR))
+    closing = (unit.conj() * -motion).real
+    weight = maximum(minimum((rim - centre) * (1.0 / FADE), 1.0), 0.0)
+    values = (unit.real, unit.imag, gap, nearness, motion.real, motion.imag, closing, touch)
+    return values, weight
 
 
 def spacecraft_features(
@@ -61,19 +104,11 @@ def spacecraft_features(
         agent_radius: Radius of every agent against the others [m].
         core_radius: Radius against obstacles [m].
     """
-    goal, course = _complex(sensed.goal), _complex(sensed.velocity)
-    # A shift that no observation, in single precision, can undo: nothing is divided by zero.
-    shifted = goal + SMALL
-    distance = np.abs(shifted)
-    frame = shifted / distance
+    course, left = _complex(sensed.velocity), settings.horizon - sensed.time
+    own, frame = own_features(
+        _complex(sensed.goal), course, sensed.heading_change, sensed.spin, left
+    )
     back = frame.conj()
-    left = time_to_go(distance, settings.horizon - sensed.time)
-    own = np.empty((len(goal), len(OWN)), np.float32)
-    np.minimum(distance[:, None], DISTANCES, out=own[:, 0:2])
-    own[:, 2:4] = _pairs(course * back)
-    np.minimum(left[:, None], TIMES, out=own[:, 4:6])
-    np.divide(distance, left + TIMES[1], out=own[:, 6])
-    own[:, 7:9] = sensed.own[:, 6:8]  # turn and spin
     # Neighbours first, then obstacles: one table for both.
     whose, slot = sensed.neighbour_mask.nonzero()
     others = sensed.neighbours[whose, slot]
@@ -86,37 +121,27 @@ def spacecraft_features(
     moving[first:, 0] = _complex(discs[:, :2])
     moving[first:, 1] = -course[owner]
     moving *= back[np.concatenate([whose, owner])][:, None]
-    apart, motion = moving[:, 0], moving[:, 1]
-    # Distances of the centres at touch, and at the rim of what is sensed.
     touch, rim = np.empty(count), np.empty(count)
     touch[:first], rim[:first] = 2.0 * agent_radius, settings.sensing_radius
     np.add(discs[:, 2], core_radius, out=touch[first:])
     np.add(discs[:, 2], settings.sensing_radius, out=rim[first:])
-    centre = np.abs(apart) + SMALL
-    unit, gap = apart / centre, centre - touch
-    table = np.empty((count, len(OBSTACLE)), np.float32)
-    table[:, 0:2] = _pairs(unit)
-    table[:, 2] = gap
-    # Deep inside another body nearness would explode.
-    np.exp(np.maximum(gap, -NEAR) * (-1.0 / NEAR), out=table[:, 3])
-    table[:, 4:6] = moving.view(np.float64)[:, 2:]
-    table[:, 6] = (unit.conj() * -motion).real
-    table[:, 7] = touch
-    weight = np.minimum((rim - centre) * (1.0 / FADE), 1.0)
-    weight = np.maximum(weight, 0.0).astype(np.float32)
+    bodies, weight = body_features(moving[:, 0], moving[:, 1], touch, rim)
+    table, weight = _table(bodies, count), weight.astype(np.float32)
     return SetFeatures(
-        own,
+        _table(own, len(left)),
         Elements(table[:first, : len(NEIGHBOUR)], whose, weight[:first]),
         Elements(table[first:], owner, weight[first:]),
         frame,
     )
 
 
+def _table(columns: Any, rows: int) -> Float32Array:
+    table = np.empty((rows, len(columns)), np.float32)
+    for place, column in enumerate(columns):
+        table[:, place] = column
+    return table
+
+
 def _complex(vectors: FloatArray) -> ComplexArray:
     value: ComplexArray = vectors.view(np.complex128)[..., 0]
-    return value
-
-
-def _pairs(values: ComplexArray) -> FloatArray:
-    value: FloatArray = values.view(np.float64).reshape(len(values), 2)
     return value

@@ -171,10 +171,10 @@ def _own_features(graph: _Graph, source: SpacecraftSource, own: str) -> tuple[Ve
     left = graph.do("Sub", source.policy.settings.horizon, graph.columns(own, [8]))
     needed = graph.do("Max", graph.do("Div", distance, CRUISE_SPEED), LEAST_TIME)
     left = graph.do("Max", needed, left)
-    soon = float(features.TIMES[1])
+    soon = float(features.SOON)
     columns = (
         distance,
-        graph.do("Min", distance, float(features.DISTANCES[1])),
+        graph.do("Min", distance, float(features.CLOSE)),
         *course,
         left,
         graph.do("Min", left, soon),
