@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import lagros_policies
-from lagros_benchmarks.evidence.claims import position_margin
+from lagros_benchmarks.tasks.spacecraft.claims import position_margin
 from lagros_benchmarks.report.records import summarise
 from lagros_benchmarks.report.tables import csv_text
 from lagros_benchmarks.run.runner import run_benchmark

@@ -25,14 +25,9 @@ if TYPE_CHECKING:
     from lagros_benchmarks.worst_case.attack import AttackSettings
     from lagros_benchmarks.worst_case.replay import Outcome
 
-BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
-# Flights per episode: a flight of six spacecraft costs what a hundred of a cart-pole do.
-BUDGETS = {"cartpole": 1000, "spacecraft": 100}
-EPISODES = {"cartpole": 10, "spacecraft": 3}
-
 
 def attack(
-    task: Annotated[str, typer.Argument(help="cartpole or spacecraft.")],
+    task: Annotated[str, typer.Argument(help="As for `lagros bench`.")],
     policy: Annotated[
         str, typer.Option(metavar="NAME", help="A policy of the task, as for `lagros bench`.")
     ] = "lagros",
@@ -46,22 +41,22 @@ def attack(
         float | None,
         typer.Option(
             metavar="D",
-            help="Bound d̄ of the disturbance, in units of the state per second. "
-            "(default: 0.75 for cartpole, 0.4 for spacecraft)",
+            help="Bound d̄ of the disturbance, in units of the state per second; the task's own "
+            "if not given.",
         ),
     ] = None,
     episodes: Annotated[
         int | None,
-        typer.Option(help="Episodes, each with its own worst case. (default: 10; spacecraft 3)"),
+        typer.Option(help="Episodes, each with its own worst case; the task's own if not given."),
     ] = None,
     budget: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Flights per episode. (default: 1000; spacecraft 100)"),
+        typer.Option(metavar="N", help="Flights per episode; the task's own if not given."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of episodes and search.")] = 0,
     method: Annotated[
         str,
-        typer.Option(help="Of random, cross-entropy, cma, gradient, hybrid; cartpole only."),
+        typer.Option(help="Of random, cross-entropy, cma, gradient, hybrid; for one body."),
     ] = "hybrid",
     safety_filter: Annotated[
         bool, typer.Option("--safety-filter", help="Put the safety filter on the policy.")
@@ -121,27 +116,25 @@ def _settings(
     seed: int,
     method: str,
 ) -> AttackSettings:
-    from lagros_benchmarks.run.settings import check_task
-    from lagros_benchmarks.worst_case.attack import AttackSettings
+    from lagros_benchmarks.worst_case.attack import AttackSettings, bench_of
     from lagros_benchmarks.worst_case.search import SearchSettings
+    from lagros_envs.registry import task_named
 
-    check_task(task)
-    if task == "spacecraft" and method != "hybrid":
-        raise ValueError(
-            f"--method {method}: the spacecraft has one search only; leave --method out"
-        )
     if method == "cma":
         check_extra("--method cma", "attack")
-    flights = BUDGETS[task] if budget is None else budget
-    population = 30 if task == "cartpole" else 16
+    defaults = task_named(task).defaults
     return AttackSettings(
         task=task,
         policy=policy,
         goal=goal,
-        bound=BOUNDS[task] if bound is None else bound,
-        episodes=EPISODES[task] if episodes is None else episodes,
+        bound=defaults.bound if bound is None else bound,
+        episodes=defaults.attack_episodes if episodes is None else episodes,
         seed=seed,
-        search=SearchSettings(method, budget=flights, population=population),
+        search=SearchSettings(
+            method,
+            budget=defaults.attack_budget if budget is None else budget,
+            population=bench_of(task).population,
+        ),
     )
 
 
@@ -167,11 +160,11 @@ def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> No
 
 
 def _replay(task: str, policy: str, path: Path) -> None:
-    from lagros_benchmarks.run.settings import check_task
     from lagros_benchmarks.worst_case.attack import fly_again
     from lagros_benchmarks.worst_case.replay import load_worst_cases
+    from lagros_envs.registry import task_named
 
-    check_task(task)
+    task_named(task)
     try:
         cases = load_worst_cases(path)
         _check_command(cases.command, task, policy)
@@ -228,11 +221,10 @@ def summary(row: dict[str, Any]) -> list[str]:
         f"(random: worst {row['random_score_worst']:.4g})",
     ]
     if row.get("max_tracking_error_max") is not None:
-        left = round((1.0 - row["in_region_rate"]) * count)
-        lines.append(
-            f"observed tube {row['max_tracking_error_max']:.3g}; {left} of {count} flights left "
-            "the region of the metric"
-        )
+        lines.append(f"observed tube {row['max_tracking_error_max']:.3g}")
+        if row.get("in_region_rate") is not None:
+            left = round((1.0 - row["in_region_rate"]) * count)
+            lines[-1] += f"; {left} of {count} flights left the region of the metric"
     if row.get("share_of_certified_max") is not None:
         lines.append(
             f"observed position error {row['max_position_error_max']:.3g} m, "

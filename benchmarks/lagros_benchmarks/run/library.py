@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_benchmarks.evidence.claims import position_margin
+from lagros_benchmarks.tasks.spacecraft.claims import position_margin
 from lagros_benchmarks.run.process import undone
 
 FloatArray = NDArray[np.float64]

@@ -24,7 +24,7 @@ class Room:
         tables: The texts and columns of its tables.
         figures: Its figures.
         game: What `lagros watch` plays.
-        attack: The search for the worst disturbance.
+        attack: Episodes and search of an attack, a `worst_case.attack.Bench`.
         certify: The certificate.
         reproduce: Everything from nothing.
         train: Training by reinforcement.
@@ -37,7 +37,7 @@ class Room:
     tables: str = "lagros_benchmarks.report.single_tables:TABLES"
     figures: str = "lagros_benchmarks.report.single_figures:draw"
     game: str = "lagros_benchmarks.report.watched:SingleGame"
-    attack: str = "lagros_benchmarks.worst_case.single:attack"
+    attack: str = "lagros_benchmarks.worst_case.single:SingleBench"
     certify: str = "lagros_benchmarks.evidence.single:certify"
     reproduce: str = "lagros_benchmarks.run.reproduce:ReproduceSettings"
     train: str = "lagros_benchmarks.training.single:TRAINING"

@@ -2,52 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from time import perf_counter
-from typing import Any, cast
+from typing import Any, Protocol
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-import lagros_envs  # noqa: F401  (registers the environments)
-from lagros_benchmarks.evidence.claims import position_margin
-from lagros_benchmarks.run.episodes import ACTION
-from lagros_benchmarks.run.flying import rehearse
-from lagros_benchmarks.run.library import building, make_filter, make_single_policy
 from lagros_benchmarks.run.metrics import wilson_interval
+from lagros_benchmarks.run.room import room_of
 from lagros_benchmarks.run.settings import check_policy, check_task
-from lagros_benchmarks.tasks.cartpole.worst_case import (
-    GOALS,
-    CartPoleTarget,
-    Episodes,
-    Law,
-    draw_episodes,
-    energy_adversary,
-    policy_law,
-    random_pushes,
-    tracking_law,
-)
-from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, bare
-from lagros_benchmarks.tasks.spacecraft.plane import worst_plane_pushes
-from lagros_benchmarks.tasks.spacecraft.worst_case import (
-    PARAMETERS,
-    SpacecraftTarget,
-    first_adversaries,
-)
-from lagros_benchmarks.worst_case.certificate import TubeCheck
-from lagros_benchmarks.worst_case.optimisers import make_search
-from lagros_benchmarks.worst_case.replay import (
-    Outcome,
-    WorstCases,
-    replay_cartpole,
-    replay_spacecraft,
-)
-from lagros_benchmarks.worst_case.search import MOST, Found, SearchSettings, search
+from lagros_benchmarks.worst_case.goals import GOALS
+from lagros_benchmarks.worst_case.replay import Outcome, WorstCases
+from lagros_benchmarks.worst_case.search import MOST, Found, SearchSettings
 from lagros_benchmarks.worst_case.seeds import ATTACK
-from lagros_benchmarks.worst_case.sequences import Replay
 from lagros_envs.checks import (
     check_disturbance_bound,
     check_fields,
@@ -56,28 +25,44 @@ from lagros_envs.checks import (
     check_seed,
     check_whole,
 )
-from lagros_envs.disturbances import Disturbance
 from lagros_envs.reading import Record
-from lagros_envs.seeding import episode_seeds, episode_streams
-from lagros_envs.tasks.cartpole import task as cartpole_task
-from lagros_envs.tasks.spacecraft import task as spacecraft_task
-from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS
-from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
-from lagros_policies.remarks.policies import NeuralTubeMpcPolicy
-from lagros_policies.tasks.cartpole.expert import CartPoleExpert
-from lagros_policies.tube_mpc import TubeMpcPolicy
+from lagros_envs.registry import task_named
+from lagros_envs.seeding import episode_seeds
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 # Kind of the random disturbance that the worst case is held against.
 _BASELINE = "uniform"
-# Policies that remember a plan and nothing else: u* around it stands in for them in a search.
-_TRACKERS = (TubeMpcPolicy, NeuralTubeMpcPolicy)
 # A sequence may pass its bound by rounding alone.
 _ROUNDING = 1e-12
-# Position and velocity along the first axis of the arena, in the state of a spacecraft.
-_PLANE = [0, 3]
+
+
+class Bench(Protocol):
+    """What a task brings to an attack: `worst_case.single.SingleBench`, or that of its room.
+
+    Attributes:
+        population: Flights per question of an optimiser, by default.
+        shape: Of the pushes of one episode.
+    """
+
+    population: int
+    shape: tuple[int, ...]
+
+    def prepare(self, say: Progress) -> None:
+        """Build everything that flies."""
+
+    def search(self, say: Progress) -> list[Found]:
+        """Search the worst sequence of every episode."""
+
+    def random(self, kind: str) -> FloatArray:
+        """Return the random disturbance of every episode."""
+
+    def replay(self, pushes: FloatArray) -> list[Outcome]:
+        """Fly a sequence in each episode."""
+
+    def figures(self) -> dict[str, Any]:
+        """Return what the row of the attack says besides."""
 
 
 @dataclass(frozen=True)
@@ -85,22 +70,22 @@ class AttackSettings:
     """What is attacked and how.
 
     Attributes:
-        task: "cartpole" or "spacecraft".
+        task: As in `lagros attack TASK`.
         policy: As `lagros bench` takes it.
         goal: What to break: "tube", "success" or "clearance".
         bound: d_bar, in units of the state per second.
         episodes: Episodes, each with a worst disturbance of its own.
         seed: Seed of the run; its episodes belong to the namespace `ATTACK`.
-        search: How to search; of the spacecraft only optimiser, budget and population.
-        safety_filter: Whether the policy of the spacecraft wears the filter.
-        preset: Preset of the spacecraft's scenarios.
-        agents: Spacecraft in a world.
+        search: How to search; in worlds of many agents only optimiser, budget and population.
+        safety_filter: Whether the policy uses the safety filter, which worlds of many agents have.
+        preset: Preset of the scenarios of such worlds.
+        agents: Agents in such a world.
 
     Raises:
         ValueError: A setting is not valid.
     """
 
-    task: str = "cartpole"
+    task: str
     policy: str = "lagros"
     goal: str = "tube"
     bound: float = 0.75
@@ -117,14 +102,11 @@ class AttackSettings:
         check_task(self.task)
         check_policy(self.policy, self.task)
         check_name("goal", self.goal, GOALS)
-        check_name("preset", self.preset, PRESETS)
         check_positive("bound", self.bound)
         check_disturbance_bound("bound", self.bound)
         check_whole("episodes", self.episodes, 1, MOST)
-        check_whole("agents", self.agents, 1, MOST_AGENTS)
         check_seed(self.seed)
-        if self.safety_filter and self.task == "cartpole":
-            raise ValueError("safety_filter=True is for the task spacecraft; leave it out")
+        bench_of(self.task).check(self)
         if self.policy == "random":
             raise ValueError("policy='random' has no worst case: it draws its actions")
 
@@ -146,6 +128,11 @@ class Attack:
     cases: WorstCases
 
 
+def bench_of(task: str) -> Any:
+    """Return the class of a task's `Bench`."""
+    return room_of(task_named(task)).part("attack")
+
+
 def run_attack(settings: AttackSettings, progress: Progress | None = None) -> Attack:
     """Search the worst disturbance of every episode and fly what was found.
 
@@ -157,8 +144,17 @@ def run_attack(settings: AttackSettings, progress: Progress | None = None) -> At
         ValueError: The policy keeps a memory, or has no certificate to attack.
     """
     say = progress or (lambda _: None)
-    run = _attack_cartpole if settings.task == "cartpole" else _attack_spacecraft
-    return run(settings, say)
+    bench: Bench = bench_of(settings.task)(settings)
+    bench.prepare(say)
+    begun = perf_counter()
+    found = bench.search(say)
+    seconds = perf_counter() - begun
+    say("replaying")
+    pushes = settings.bound * np.stack([one.sequence for one in found])
+    check_bound(pushes, settings.bound)
+    outcomes, baseline = bench.replay(pushes), bench.replay(bench.random(_BASELINE))
+    row = {**_row(settings, outcomes, baseline, found, seconds), **bench.figures()}
+    return Attack(row, WorstCases(asdict(settings), pushes, tuple(outcomes)))
 
 
 def fly_again(cases: WorstCases) -> list[Outcome]:
@@ -170,16 +166,10 @@ def fly_again(cases: WorstCases) -> list[Outcome]:
     """
     settings = settings_from(cases.command)
     check_bound(cases.pushes, settings.bound)
-    check_shape(cases.pushes, settings)
-    if settings.task == "cartpole":
-        bench = _CartPoleBench(settings)
-        found = bench.replay(cases.pushes)
-    else:
-        found = [
-            replay_spacecraft(target, pushes)
-            for target, pushes in zip(_targets(settings), cases.pushes, strict=True)
-        ]
-    return found
+    bench: Bench = bench_of(settings.task)(settings)
+    check_shape(cases.pushes, settings, bench.shape)
+    bench.prepare(lambda _: None)
+    return bench.replay(cases.pushes)
 
 
 def settings_from(command: Any) -> AttackSettings:
@@ -195,21 +185,17 @@ def settings_from(command: Any) -> AttackSettings:
     return AttackSettings(**{**given.entries, "search": SearchSettings(**searched.entries)})
 
 
-def check_shape(pushes: FloatArray, settings: AttackSettings) -> None:
+def check_shape(pushes: FloatArray, settings: AttackSettings, one: tuple[int, ...]) -> None:
     """Check that there is a push for every episode, step and state of an attack.
+
+    Args:
+        pushes: Those of all episodes.
+        settings: The attack.
+        one: Shape of those of one episode.
 
     Raises:
         ValueError: There are more or fewer.
     """
-    one = (
-        (cartpole_task.CartPoleSettings().steps, cartpole_task.STATE_DIM)
-        if settings.task == "cartpole"
-        else (
-            spacecraft_task.SpacecraftSettings().steps,
-            settings.agents,
-            spacecraft_task.STATE_DIM,
-        )
-    )
     if pushes.shape != (settings.episodes, *one):
         raise ValueError(
             f"'pushes' has the shape {pushes.shape} and must have {(settings.episodes, *one)} for "
@@ -233,164 +219,6 @@ def check_bound(pushes: FloatArray, bound: float) -> None:
             f"a push has norm {largest!r}, above the bound {bound!r}: such sequences are no worst "
             "case of that bound"
         )
-
-
-class _CartPoleBench:
-    """Episodes, policy and certificate of an attack on the cart-pole."""
-
-    def __init__(self, settings: AttackSettings) -> None:
-        """Build everything, and plan the episodes."""
-        self.settings = settings
-        env: Any = gym.make("lagros/CartPole-v0", disable_env_checker=True)
-        name, build = f"policy {settings.policy!r}", make_single_policy
-        rehearse(name, build(settings.policy, env), env.reset(seed=0)[0], [True], ACTION)
-        self.policy = cast(Any, build(settings.policy, env))
-        self.tracks = type(self.policy) in _TRACKERS
-        # One whose metric is a network is held against the tube of its own.
-        self.expert: CartPoleExpert = self.policy.expert if self.tracks else CartPoleExpert()
-        if self.tracks:
-            # A plan that comes late on a busy machine must not change the figure.
-            self.policy.deadline = math.inf
-        self.episodes: Episodes = draw_episodes(self.expert, settings.episode_seeds())
-        self.certificate = TubeCheck(self.expert, self.episodes, settings.bound)
-
-    def law(self) -> Law:
-        """Return the policy as a law; for tube MPC u* around its plan, which it confirms."""
-        if self.tracks:
-            return tracking_law(self.expert, self.episodes)
-        return policy_law(self.policy, self.episodes)
-
-    def replay(self, pushes: FloatArray) -> list[Outcome]:
-        """Fly sequences (episodes, steps, 4) in the environment."""
-        outcomes = []
-        for index, one in enumerate(pushes):
-            goal = self.settings.goal
-            outcome, flight = replay_cartpole(self.episodes, index, self.policy, goal, one)
-            if flight is not None:
-                more = self.certificate.hold(np.array([index]), flight).observed(0)
-                outcome = Outcome(
-                    outcome.seed, outcome.score, outcome.broken, {**outcome.measures, **more}
-                )
-            outcomes.append(outcome)
-        return outcomes
-
-
-def _attack_cartpole(settings: AttackSettings, say: Progress) -> Attack:
-    say("planning")
-    bench = _CartPoleBench(settings)
-    target = CartPoleTarget(
-        bench.episodes,
-        bench.law(),
-        settings.goal,
-        settings.bound,
-        energy_adversary(bench.expert.metric),
-    )
-    say("searching")
-    begun = perf_counter()
-    found = search(target, settings.search, settings.seed)
-    seconds = perf_counter() - begun
-    say("replaying")
-    pushes = settings.bound * np.stack([one.sequence for one in found])
-    outcomes = bench.replay(pushes)
-    baseline = bench.replay(random_pushes(bench.episodes, _BASELINE, settings.bound))
-    row = _row(settings, outcomes, baseline, found, seconds)
-    row["unplanned"] = len(bench.episodes.unplanned)
-    return Attack(row, _cases(settings, pushes, outcomes))
-
-
-def _targets(settings: AttackSettings) -> list[SpacecraftTarget]:
-    """Return one target per world; they share the policy."""
-    # The bound is what policies prepare for.
-    env = SpacecraftVectorEnv(
-        settings.agents, settings.agents, settings.preset, "none", settings.bound
-    )
-    first = make_single_policy(settings.policy, env)
-    WorldsLoop(env, first).rehearse(f"policy {settings.policy!r}", [0])
-    policy = make_single_policy(settings.policy, env)
-    if settings.safety_filter:
-        with building(f"policy {settings.policy!r} with the safety filter"):
-            policy = make_filter(policy, env, settings.bound)
-    margin = position_margin(policy, settings.bound)
-    return [
-        SpacecraftTarget(
-            policy,
-            seed,
-            settings.agents,
-            settings.preset,
-            settings.bound,
-            settings.goal,
-            margin,
-        )
-        for seed in settings.episode_seeds()
-    ]
-
-
-def _attack_spacecraft(settings: AttackSettings, say: Progress) -> Attack:
-    begun = perf_counter()
-    found, outcomes, baseline = [], [], []
-    for number, target in enumerate(_targets(settings)):
-        say(f"world {number + 1} of {settings.episodes}")
-        rng = np.random.default_rng([settings.seed, number])
-        one = _search_adversary(target, settings.search, rng)
-        if target.goal == "tube":
-            # Beside what the adversary sees, the sequence that the error's own loop stands worst.
-            known = _fly_known(target)
-            worse = known if known.score > one.score else one
-            one = replace(worse, flights=one.flights + 1)
-        found.append(one)
-        outcomes.append(replay_spacecraft(target, settings.bound * one.sequence))
-        baseline.append(replay_spacecraft(target, _drawn(settings, target)))
-    seconds = perf_counter() - begun
-    pushes = settings.bound * np.stack([one.sequence for one in found])
-    row = _row(settings, outcomes, baseline, found, seconds)
-    shared = {"preset": settings.preset, "agents": settings.agents}
-    return Attack({**row, **shared}, _cases(settings, pushes, outcomes))
-
-
-def _search_adversary(
-    target: SpacecraftTarget, settings: SearchSettings, rng: np.random.Generator
-) -> Found:
-    """Search the nine numbers of the adversary, and return what its worst flight did."""
-    chosen = make_search(settings.optimiser, PARAMETERS, settings.population, rng)
-    points = first_adversaries()[: settings.budget]
-    best: Found | None = None
-    flights = 0
-    while True:
-        scores, pushes = target.try_adversaries(points)
-        flights += len(points)
-        worst = int(np.argmax(scores))
-        if best is None or scores[worst] > best.score:
-            best = Found(pushes[worst] / target.bound, float(scores[worst]), flights)
-        if flights > len(first_adversaries()):
-            chosen.tell(points, scores)
-        if flights + settings.population > settings.budget:
-            return Found(best.sequence, best.score, flights)
-        points = chosen.ask()
-
-
-def _fly_known(target: SpacecraftTarget) -> Found:
-    """Fly the sequence that is the worst for the position error of any agent that is tracked."""
-    tracking: Any = getattr(bare(target.policy), "tracking", None)
-    task = spacecraft_task.SpacecraftSettings()
-    along = worst_plane_pushes(tracking, target.bound, task.steps)
-    sequence = np.zeros((task.steps, target.agents, spacecraft_task.STATE_DIM))
-    sequence[..., _PLANE] = along[:, None]
-    given = Replay(target.bound * sequence, task.control_period)
-    return Found(sequence, float(target.fly(target.environment(1, given)).scores[0]), 1)
-
-
-def _drawn(settings: AttackSettings, target: SpacecraftTarget) -> FloatArray:
-    """Return the random disturbance of a world, shape (steps, agents, 6)."""
-    task = spacecraft_task.SpacecraftSettings()
-    disturbance = Disturbance(_BASELINE, settings.bound, (True,) * spacecraft_task.STATE_DIM)
-    streams = episode_streams(target.seed).disturbance.spawn(settings.agents)
-    drawn = [disturbance.realise(stream, task.steps, task.control_period) for stream in streams]
-    return np.stack(drawn, axis=1)
-
-
-def _cases(settings: AttackSettings, pushes: FloatArray, outcomes: list[Outcome]) -> WorstCases:
-    check_bound(pushes, settings.bound)
-    return WorstCases(asdict(settings), pushes, tuple(outcomes))
 
 
 def _row(

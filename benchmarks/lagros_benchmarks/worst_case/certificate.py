@@ -1,19 +1,17 @@
-"""Whether flights of the cart-pole kept what Theorem 1 promises, as far as that goes."""
+"""Whether flights kept what Theorem 1 promises, as far as that goes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.run.episodes import TUBE_TOLERANCE
-from lagros_benchmarks.tasks.cartpole.worst_case import CartPoleTarget, Episodes, Flights, fly
+from lagros_benchmarks.worst_case.flights import Episodes, Flights
 from lagros_envs.dynamics import control_matrix
-from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction import certified_tube
-from lagros_policies.contraction.metric import region_angle
-from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -25,7 +23,7 @@ class Held:
     """Flights held against the tube of Theorem 1; every array has shape (b,).
 
     Attributes:
-        learning_error: Largest |u - u*| while in the region [N].
+        learning_error: Largest ||u - u*|| while in the region.
         in_region: Whether the flight never left the region of the metric.
         certified_share: Largest ||e(t)|| / r_l(t) until the first instant outside, that instant
             included: the state came there from inside.
@@ -53,20 +51,23 @@ class TubeCheck:
     Its hypotheses are that the state has stayed in the region of the metric so far and that
     ||u - u*|| <= eps_l; a flight that leaves the region is not held against it any longer. The
     eps_l of a flight is the one that it had, so that any policy can be asked. The tube is the
-    paper's formula, with alpha as it is: for a metric of the angle and a disturbance of the angle
-    that is not a bound (`theorems.disturbed_rate`), and what is found here is an observation.
+    paper's formula, with alpha as it is: for a metric of the state and a disturbance of what it
+    depends on that is not a bound (`theorems.disturbed_rate`), and what is found is an observation.
 
     Args:
         expert: The law u* with its metric.
         episodes: The episodes.
         bound: d_bar, in units of the state per second.
+        gain: b_bar, a bound of ||B(x)|| on the region; None to observe it at states drawn there.
     """
 
-    def __init__(self, expert: CartPoleExpert, episodes: Episodes, bound: float) -> None:
+    def __init__(
+        self, expert: Any, episodes: Episodes, bound: float, gain: float | None = None
+    ) -> None:
         """Prepare the plans."""
         self._expert, self._episodes, self._bound = expert, episodes, bound
         self._tracked = expert.track(episodes.plans, episodes.controls)
-        self._gain = largest_gain(expert)
+        self._gain = sampled_gain(expert) if gain is None else gain
 
     def hold(self, episode: IntArray, flights: Flights) -> Held:
         """Hold flights against the tube.
@@ -100,45 +101,20 @@ class TubeCheck:
         )
 
     def _learning_error(self, episode: IntArray, flights: Flights, acting: BoolArray) -> FloatArray:
-        """Return the largest |u - u*| of each flight where it acts inside the region, (b,) [N]."""
+        """Return the largest ||u - u*|| of each flight where it acts inside the region, (b,)."""
         flight, step = np.nonzero(acting)
         missed = np.zeros(acting.shape)
         if len(flight):
             wanted = self._expert.control(
                 self._tracked, episode[flight], step, flights.states[flight, step]
             )
-            missed[flight, step] = np.abs(flights.forces[flight, step, 0] - wanted[:, 0])
+            off = flights.controls[flight, step] - wanted
+            missed[flight, step] = np.linalg.norm(off, axis=-1)
         return np.asarray(missed.max(axis=1))
 
 
-@dataclass(frozen=True)
-class CertificateTarget(CartPoleTarget):
-    """The same flights, scored by what they use of the tube of Theorem 1 while it holds.
-
-    What breaks the published tube throws the pole about, and has left the region of the metric by
-    then; this looks for the share that counts.
-
-    Attributes:
-        check: The tube; it must be given.
-    """
-
-    check: TubeCheck | None = None
-
-    @property
-    def slope_cost(self) -> int:
-        """None: the share has a jump where a flight leaves the region."""
-        return 0
-
-    def scores(self, episode: IntArray, sequences: FloatArray) -> FloatArray:
-        """Return the largest share (b,) of the tube under d/d_bar (b, steps, 4)."""
-        assert self.check is not None
-        flights = fly(self.flown, self.law, episode, self.bound * sequences)
-        return self.check.hold(episode, flights).certified_share
-
-
-def largest_gain(expert: CartPoleExpert, points: int = 1001) -> float:
-    """Return b_bar, the largest ||B(x)|| over a grid of the region's angles (observed)."""
-    states = np.zeros((points, task.STATE_DIM))
-    states[:, 1] = np.linspace(0.0, region_angle(expert.metric), points)
-    matrices = control_matrix(expert.task.system, states)
-    return float(np.linalg.norm(matrices, axis=(1, 2)).max())
+def sampled_gain(expert: Any, points: int = 10_000) -> float:
+    """Return b_bar, the largest ||B(x)|| over states drawn from the metric's region (observed)."""
+    drawn = expert.metric.region.sample(np.random.default_rng(0), points)
+    matrices = control_matrix(expert.task.system, drawn.state)
+    return float(np.linalg.norm(matrices, ord=2, axis=(1, 2)).max())

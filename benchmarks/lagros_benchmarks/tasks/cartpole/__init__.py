@@ -1,1 +1,5 @@
 """What the cart-pole adds to the benchmark."""
+
+from lagros_benchmarks.run.room import Room
+
+ROOM = Room(attack="lagros_benchmarks.tasks.cartpole.attack:CartPoleBench")

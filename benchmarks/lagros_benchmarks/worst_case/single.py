@@ -1,0 +1,332 @@
+"""One body under attack: the target of the search, and its flights in the environment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+
+from lagros_benchmarks.run.episodes import TUBE_TOLERANCE
+from lagros_benchmarks.run.flying import Attempt, ask, rehearse, reseed
+from lagros_benchmarks.run.library import Policy, make_single_policy
+from lagros_benchmarks.worst_case.certificate import TubeCheck
+from lagros_benchmarks.worst_case.flights import (
+    Episodes,
+    FloatArray,
+    Flights,
+    IntArray,
+    Law,
+    ahead,
+    disc_gap,
+    draw_episodes,
+    expert_of,
+    fly,
+    policy_law,
+    random_pushes,
+    tracking_law,
+)
+from lagros_benchmarks.worst_case.goals import gradient, scores, tracking_error
+from lagros_benchmarks.worst_case.replay import Outcome
+from lagros_benchmarks.worst_case.search import Found, search
+from lagros_benchmarks.worst_case.sequences import Replay
+from lagros_envs.disturbances import onto_unit_sphere
+from lagros_envs.registry import task_named
+from lagros_envs.task import LARGEST_DISTANCE, Task
+from lagros_policies.contraction import ContractionMetric
+from lagros_policies.tube_mpc import TubeMpcPolicy
+
+# States and plans (b, n) to directions (b, n).
+Adversary = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class SingleTarget:
+    """Episodes of one policy under one bound, with one goal.
+
+    Attributes:
+        flown: The episodes.
+        law: The policy.
+        goal: One of `GOALS`.
+        bound: d_bar, in units of the state per second.
+        adversary: A feedback whose pushes are tried first; None for none.
+    """
+
+    flown: Episodes
+    law: Law
+    goal: str
+    bound: float
+    adversary: Adversary | None = None
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return len(self.flown.seeds)
+
+    @property
+    def steps(self) -> int:
+        """Control steps of an episode."""
+        return self.flown.settings.steps
+
+    @property
+    def channels(self) -> int:
+        """Coordinates of d."""
+        return self.flown.settings.system.state_dim
+
+    @property
+    def slope_cost(self) -> int:
+        """Two closed-loop steps per state, and two per push, at every instant."""
+        return 4 * self.channels
+
+    def scores(self, episode: IntArray, sequences: FloatArray) -> FloatArray:
+        """Return how bad the flights (b,) under d/d_bar (b, steps, n) are."""
+        flights = fly(self.flown, self.law, episode, self.bound * sequences)
+        return scores(self.flown, self.goal, episode, flights)[0]
+
+    def slopes(self, episode: IntArray, sequences: FloatArray) -> FloatArray:
+        """Return the slopes of the scores by the sequences, up to a factor."""
+        pushes = self.bound * sequences
+        flights = fly(self.flown, self.law, episode, pushes)
+        return gradient(self.flown, self.law, self.goal, episode, pushes, flights)
+
+    def starts(self) -> FloatArray:
+        """Return constant pushes along every axis, and what the adversary did."""
+        axes = np.concatenate([np.eye(self.channels), -np.eye(self.channels)])
+        axes = np.repeat(axes[:, None], self.steps, axis=1)
+        constant = np.broadcast_to(axes, (self.episodes, *axes.shape))
+        if self.adversary is None:
+            return constant
+        return np.concatenate([constant, self._recorded(self.adversary)[:, None]], axis=1)
+
+    def _recorded(self, adversary: Adversary) -> FloatArray:
+        """Fly every episode under the adversary and return d/d_bar, (episodes, steps, n)."""
+        task, episode = self.flown.settings, np.arange(self.episodes)
+        state = self.flown.initial_states
+        pushes = np.zeros((self.episodes, self.steps, self.channels))
+        fallback = np.eye(self.channels)[0]
+        for step in range(self.steps):
+            push = adversary(state, self.flown.plans[:, step])
+            pushes[:, step] = onto_unit_sphere(np.nan_to_num(push), fallback)
+            control = self.law(state, episode, np.full(self.episodes, step))
+            state = ahead(task, state, control, self.bound * pushes[:, step])
+            state = np.clip(np.nan_to_num(state), -LARGEST_DISTANCE, LARGEST_DISTANCE)
+        return pushes
+
+
+@dataclass(frozen=True)
+class CertificateTarget(SingleTarget):
+    """The same flights, scored by what they use of the tube of Theorem 1 while it holds.
+
+    What breaks the tube of success has left the region of the metric by then; this looks for the
+    share that counts.
+
+    Attributes:
+        check: The tube; it must be given.
+    """
+
+    check: TubeCheck | None = None
+
+    @property
+    def slope_cost(self) -> int:
+        """None: the share has a jump where a flight leaves the region."""
+        return 0
+
+    def scores(self, episode: IntArray, sequences: FloatArray) -> FloatArray:
+        """Return the largest share (b,) of the tube under d/d_bar (b, steps, n)."""
+        assert self.check is not None
+        flights = fly(self.flown, self.law, episode, self.bound * sequences)
+        return self.check.hold(episode, flights).certified_share
+
+
+def energy_adversary(metric: ContractionMetric) -> Adversary:
+    """Return the feedback that pushes along M e, as the disturbance kind "worst" does."""
+
+    def push(state: FloatArray, nominal: FloatArray) -> FloatArray:
+        place = nominal if getattr(metric, "point", "state") == "nominal" else state
+        return np.asarray(np.einsum("bij,bj->bi", metric.matrix(place), state - nominal))
+
+    return push
+
+
+class SingleBench:
+    """Episodes, policy and certificate of an attack on one body.
+
+    Args:
+        settings: An `AttackSettings`.
+
+    Attributes:
+        shape: Of the pushes of one episode.
+    """
+
+    population = 30
+
+    def __init__(self, settings: Any) -> None:
+        """Find the task."""
+        self.settings = settings
+        self.task = cast(Task, task_named(settings.task))
+        self.shape = (self.task.steps, self.task.system.state_dim)
+
+    @staticmethod
+    def check(settings: Any) -> None:
+        """Check what only worlds of many agents have.
+
+        Raises:
+            ValueError: The safety filter is asked for.
+        """
+        if settings.safety_filter:
+            raise ValueError(
+                f"safety_filter=True is for worlds of many agents; leave it out for {settings.task}"
+            )
+
+    def prepare(self, say: Callable[[str], None]) -> None:
+        """Build everything, and plan the episodes."""
+        say("planning")
+        env: Any = gym.make(self.task.env_id, disable_env_checker=True)
+        name, action = f"policy {self.settings.policy!r}", env.action_space.shape
+        build = make_single_policy
+        rehearse(
+            name, build(self.settings.policy, env), env.reset(seed=0)[0], [True], action
+        )
+        policy = build(self.settings.policy, env)
+        # One that remembers a plan and nothing else: u* around it stands in for it in a search.
+        # What a user derives from ours is another law.
+        self.tracks = isinstance(policy, TubeMpcPolicy) and type(policy).__module__.startswith(
+            "lagros_policies."
+        )
+        self.policy: Any = policy
+        # One whose metric is a network is held against the tube of its own.
+        self.expert: Any = self.policy.expert if self.tracks else expert_of(self.task)
+        if self.tracks:
+            # A plan that comes late on a busy machine must not change the figure.
+            self.policy.deadline = math.inf
+        self.episodes = draw_episodes(self.expert, self.settings.episode_seeds())
+        self.certificate = self.check_of()
+
+    def check_of(self) -> TubeCheck:
+        """Return the tube of Theorem 1 around the plans."""
+        return TubeCheck(self.expert, self.episodes, self.settings.bound)
+
+    def law(self) -> Law:
+        """Return the policy as a law; for tube MPC u* around its plan, which it confirms."""
+        if self.tracks:
+            return tracking_law(self.expert, self.episodes)
+        return policy_law(self.policy, self.episodes)
+
+    def search(self, say: Callable[[str], None]) -> list[Found]:
+        """Search the worst sequence of every episode."""
+        say("searching")
+        target = SingleTarget(
+            self.episodes,
+            self.law(),
+            self.settings.goal,
+            self.settings.bound,
+            energy_adversary(self.expert.metric),
+        )
+        return search(target, self.settings.search, self.settings.seed)
+
+    def random(self, kind: str) -> FloatArray:
+        """Return the random disturbance of every episode, shape (episodes, steps, n)."""
+        return random_pushes(self.episodes, kind, self.settings.bound)
+
+    def replay(self, pushes: FloatArray) -> list[Outcome]:
+        """Fly sequences (episodes, steps, n) in the environment."""
+        outcomes = []
+        for index, one in enumerate(pushes):
+            goal = self.settings.goal
+            outcome, flight = replay_single(self.episodes, index, self.policy, goal, one)
+            if flight is not None:
+                more = self.certificate.hold(np.array([index]), flight).observed(0)
+                measures = {**outcome.measures, **self.measures(flight), **more}
+                outcome = replace(outcome, measures=measures)
+            outcomes.append(outcome)
+        return outcomes
+
+    def measures(self, flight: Flights) -> dict[str, float]:
+        """Return further figures of a single flight, by name."""
+        gap = float(flight.gaps[flight.alive].min())
+        return {"least_gap": gap} if math.isfinite(gap) else {}
+
+    def figures(self) -> dict[str, Any]:
+        """Return what the row of the attack says besides."""
+        return {"unplanned": len(self.episodes.unplanned)}
+
+
+def replay_single(
+    episodes: Episodes, index: int, policy: Policy, goal: str, pushes: FloatArray
+) -> tuple[Outcome, Flights | None]:
+    """Fly one sequence in the environment.
+
+    Args:
+        episodes: The episodes.
+        index: Which of them.
+        policy: The policy.
+        goal: As for `goals.profile`.
+        pushes: d, shape (steps, n).
+
+    Returns:
+        The outcome, and the flight for further questions; None where it raised.
+    """
+    task = episodes.settings
+    given = Replay(pushes, task.control_period)
+    env: Any = gym.make(
+        task.env_id,
+        disturbance=given,
+        disturbance_bound=given.bound,
+        settings=task,
+        max_episode_steps=task.steps,
+        disable_env_checker=True,
+    ).unwrapped
+    seed = episodes.seeds[index]
+    with Attempt() as attempt:
+        flight, info = _flight(env, policy, seed, episodes.plans[index])
+    if attempt.error is not None:
+        return Outcome(seed, math.inf, True, {}, attempt.error), None
+    where = np.array([index])
+    score = float(scores(episodes, goal, where, flight)[0][0])
+    errors = tracking_error(episodes, where, flight.states)[0][flight.alive[0]]
+    radius = task.success_radius(task.control_period * np.arange(len(errors)))
+    lost = bool(flight.lost[0])
+    left = lost or bool(np.any(errors > radius + TUBE_TOLERANCE))
+    broken = {"tube": left, "success": not info["success"], "clearance": lost}[goal]
+    measures = {
+        "success": bool(info["success"]),
+        "strict_success": not lost and bool(info["inside_tube"]),
+        "fallen": bool(flight.fallen[0]),
+        **({"collided": bool(flight.collided[0])} if "collided" in info else {}),
+        "left_paper_tube": left,
+        "max_tracking_error": float(errors.max()),
+    }
+    return Outcome(seed, score, bool(broken), measures), flight
+
+
+def _flight(
+    env: Any, policy: Policy, seed: int, nominal: FloatArray
+) -> tuple[Flights, dict[str, Any]]:
+    task: Task = env.settings
+    observation, info = env.reset(seed=seed, options={"nominal": nominal})
+    discs = env.scenario.discs[None] if task.position else np.zeros((1, 0, 3))
+    states = np.empty((1, task.steps + 1, task.system.state_dim))
+    states[0, :] = env.state
+    controls = np.zeros((1, task.steps, task.system.control_dim))
+    centre, scale = np.array(task.control_centre), np.array(task.control_scale)
+    alive = np.zeros(states.shape[:2], bool)
+    gaps = np.full(states.shape[:2], np.inf)
+    alive[0, 0], gaps[:, 0] = True, disc_gap(task, states[:, 0], states[:, 0], discs)
+    reseed(policy, seed)
+    memory: Any = None
+    over = False
+    for step in range(task.steps):
+        action, memory, _ = ask(policy, observation, memory, [step == 0], env.action_space.shape)
+        controls[0, step] = centre + scale * action.astype(np.float64)
+        observation, _, over, _, info = env.step(action)
+        states[0, step + 1 :] = env.state
+        alive[0, step + 1] = True
+        gaps[:, step + 1] = disc_gap(task, states[:, step], states[:, step + 1], discs)
+        if over:
+            break
+    collided = bool(info.get("collided", False))
+    ended = np.array([over and not collided]), np.array([collided])
+    return Flights(states, controls, alive, *ended, gaps), info
