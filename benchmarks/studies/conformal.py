@@ -25,17 +25,17 @@ from rich.console import Console
 from rich.table import Table
 
 from lagros_benchmarks.evidence.calibration import (
-    CARTPOLE_SCORES,
-    SPACECRAFT_SCORES,
     EpisodeScores,
     Score,
-    cartpole_scores,
     pretrained_hash,
-    spacecraft_scores,
+    single_scores,
 )
+from lagros_benchmarks.evidence.calibration import scores_of as calibrated_of
 from lagros_benchmarks.run.files import write_json
+from lagros_benchmarks.tasks.spacecraft.calibration import POSITION_ERROR, spacecraft_scores
 from lagros_benchmarks.worst_case.seeds import CALIBRATION, VERIFICATION
 from lagros_envs.files import write_atomic
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.contraction.conformal import (
     check_coverage,
     conformal_bound,
@@ -48,8 +48,8 @@ FOLDER = Path("runs/conformal")
 LEVELS = (0.8, 0.9, 0.95)
 _SPLITS = 500
 SCORES: dict[str, tuple[Score, ...]] = {
-    "cartpole": CARTPOLE_SCORES,
-    "spacecraft": SPACECRAFT_SCORES,
+    "cartpole": calibrated_of(CartPoleSettings()),
+    "spacecraft": (POSITION_ERROR,),
 }
 # Seed of the random splits alone.
 _SPLIT_SEED = 20210226
@@ -76,7 +76,8 @@ def scores_of(
         values = {key: np.array(entry, float) for key, entry in record["values"].items()}
         return EpisodeScores(values, record["failed"], record["seconds"]), record["seconds"]
     if case["task"] == "cartpole":
-        found = cartpole_scores(case["policy"], count, namespace, 0, case["kind"], case["bound"])
+        how = (case["policy"], count, namespace, 0, case["kind"], case["bound"])
+        found = single_scores(CartPoleSettings(), *how)
     else:
         found = spacecraft_scores(count, namespace, 0, case["kind"], case["bound"])
     # JSON of Python reads and writes Infinity; the file is ours alone.

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from lagros_benchmarks.evidence.evidence import metric_to_prove
-from lagros_benchmarks.tasks.cartpole.worst_case import (
+from lagros_benchmarks.tasks.cartpole.certify import metric_to_prove
+from lagros_benchmarks.worst_case.flights import (
     Episodes,
     draw_episodes,
     fly,
@@ -46,7 +46,7 @@ def loop(metric: Metric, drawn: Episodes) -> dict[str, Any]:
     outside = error > drawn.settings.tube.radius(times)
     # At t = 0 error and radius are both zero.
     outside[:, 0] = False
-    efforts = drawn.settings.control_period * np.sum(flown.forces**2, axis=(1, 2))
+    efforts = drawn.settings.control_period * np.sum(flown.controls**2, axis=(1, 2))
     return {
         "episodes": len(every),
         "fell": int(np.count_nonzero(flown.fallen)),

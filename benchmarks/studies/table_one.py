@@ -26,11 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401  (registers the environment)
-from lagros_benchmarks.commands.certify import certify_cartpole
-from lagros_benchmarks.evidence.evidence import recorded_error
+from lagros_benchmarks.evidence.records import recorded_error
+from lagros_benchmarks.evidence.single import Question
+from lagros_benchmarks.tasks.cartpole.certify import certify
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.contraction import diverging_bound
 from lagros_policies.contraction.tube import Tube
 from lagros_policies.policy import make
@@ -120,7 +122,7 @@ def bounded(row: dict[str, Any], certificate: dict[str, Any]) -> dict[str, Any]:
     times = np.array(_TIMES)
     follows_plan = row["distance_to_plan"] < row["distance_to_control"]
     if follows_plan:
-        error = recorded_error("cartpole", row["policy"])
+        error = recorded_error(CartPoleSettings(), row["policy"])
         radii = diverging_bound(
             times, certificate["lipschitz"], _BOUND, error, certificate["b_bar"]
         )
@@ -197,7 +199,8 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--seconds", type=float, default=60.0, help="for each proof")
     wanted = parser.parse_args()
-    found = certify_cartpole(None, "lagros", _BOUND, wanted.episodes, wanted.seconds)
+    asked = Question("lagros", _BOUND, wanted.episodes, seconds=wanted.seconds)
+    found = certify(CartPoleSettings(), asked)
     certificate = found.as_json()
     env = gym.make("lagros/CartPole-v0", disable_env_checker=True)
     rows = []

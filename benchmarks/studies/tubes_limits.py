@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tubes_flights import NAMESPACE, PERIOD, UPRIGHT, resting_plans, steepest_share
 
-from lagros_benchmarks.tasks.cartpole.worst_case import draw_episodes, random_pushes
+from lagros_benchmarks.worst_case.flights import draw_episodes, random_pushes
 from lagros_envs.dynamics import hold_step
 from lagros_envs.dynamics.integrate import SUBSTEPS
 from lagros_envs.files import write_atomic

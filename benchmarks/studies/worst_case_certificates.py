@@ -39,10 +39,19 @@ from worst_case_tracking import KINDS, SEED, SPACECRAFT_BOUNDS, drawn, spacecraf
 
 from lagros_benchmarks.evidence.calibration import pretrained_hash
 from lagros_benchmarks.run.files import plain, write_json
-from lagros_benchmarks.tasks.cartpole import worst_case as cartpole
-from lagros_benchmarks.worst_case.certificate import CertificateTarget, TubeCheck
+from lagros_benchmarks.tasks.cartpole.attack import largest_gain
+from lagros_benchmarks.worst_case.certificate import TubeCheck
+from lagros_benchmarks.worst_case.flights import (
+    Episodes,
+    Law,
+    draw_episodes,
+    fly,
+    policy_law,
+    tracking_law,
+)
 from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_benchmarks.worst_case.seeds import ATTACK
+from lagros_benchmarks.worst_case.single import CertificateTarget, SingleTarget, energy_adversary
 from lagros_envs.dynamics import hold_step
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds, episode_streams
@@ -99,9 +108,7 @@ def kept(name: str, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     return dict(piece)
 
 
-def mixed_pushes(
-    target: cartpole.CartPoleTarget, draws: int, given: SearchSettings
-) -> dict[str, FloatArray]:
+def mixed_pushes(target: SingleTarget, draws: int, given: SearchSettings) -> dict[str, FloatArray]:
     """Return d/d_bar of all flights by how they were made, each (episodes, k, steps, 4)."""
     settings = target.flown.settings
     random = np.stack(
@@ -127,14 +134,14 @@ def mixed_pushes(
 def held_case(policy: str, bound: float) -> dict[str, Any]:
     """Fly one policy under one bound against Theorem 1's tube."""
     expert = CartPoleExpert()
-    episodes = cartpole.draw_episodes(expert, episode_seeds(SEED, _HELD_SCENARIOS, ATTACK))
+    episodes = draw_episodes(expert, episode_seeds(SEED, _HELD_SCENARIOS, ATTACK))
     if policy == "tube-mpc":
-        law = cartpole.tracking_law(expert, episodes)
+        law = tracking_law(expert, episodes)
     else:
-        law = cartpole.policy_law(LagrosPolicy(expert.task), episodes)
-    adversary = cartpole.energy_adversary(expert.metric)
-    target = cartpole.CartPoleTarget(episodes, law, "tube", bound, adversary)
-    check = TubeCheck(expert, episodes, bound)
+        law = policy_law(LagrosPolicy(expert.task), episodes)
+    adversary = energy_adversary(expert.metric)
+    target = SingleTarget(episodes, law, "tube", bound, adversary)
+    check = TubeCheck(expert, episodes, bound, largest_gain(expert))
     rows = {}
     pushes = mixed_pushes(target, _HELD_DRAWS, _HELD_SEARCH)
     aimed = CertificateTarget(episodes, law, "tube", bound, adversary, check)
@@ -143,9 +150,7 @@ def held_case(policy: str, bound: float) -> dict[str, Any]:
     for name, sequences in pushes.items():
         each = sequences.shape[1]
         which = np.repeat(np.arange(len(episodes.seeds)), each)
-        flights = cartpole.fly(
-            episodes, law, which, bound * sequences.reshape(-1, *sequences.shape[2:])
-        )
+        flights = fly(episodes, law, which, bound * sequences.reshape(-1, *sequences.shape[2:]))
         held = check.hold(which, flights)
         error = np.linalg.norm(flights.states - episodes.plans[which], axis=-1)
         error = np.where(flights.alive, error, 0.0)
@@ -168,7 +173,7 @@ def ellipsoid_tube(period: float) -> HeldTube:
     return design_held_contained(CartPoleSettings().system, _PLANS, design)
 
 
-def gentle_episodes(tube: HeldTube, chunk: int) -> cartpole.Episodes:
+def gentle_episodes(tube: HeldTube, chunk: int) -> Episodes:
     """Return episodes whose plans lie in the box of a tube, at its hold.
 
     Goals are drawn until a plan fits, which is the law of the scenarios and not a choice among
@@ -208,13 +213,19 @@ def gentle_episodes(tube: HeldTube, chunk: int) -> cartpole.Episodes:
         after, left = divmod(step + 1, ratio)
         states.append(state if left else instants[:, after])
     seeds = episode_seeds(SEED + 1 + chunk, _CHUNK, ATTACK)
-    return cartpole.Episodes(
-        settings, tuple(seeds), states[0], np.stack(goals), np.stack(states, axis=1), forces
+    return Episodes(
+        settings,
+        tuple(seeds),
+        states[0],
+        np.stack(goals),
+        np.stack(states, axis=1),
+        forces,
+        np.zeros((len(seeds), 0, 3)),
     )
 
 
 def ellipsoid_shares(
-    tube: HeldTube, episodes: cartpole.Episodes, which: IntArray, pushes: FloatArray
+    tube: HeldTube, episodes: Episodes, which: IntArray, pushes: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
     """Fly episodes and return what they used of a tube, at the instants and between them.
 
@@ -229,17 +240,17 @@ def ellipsoid_shares(
         ||e||, each (b,), and which fell.
     """
     law = ellipsoid_law(tube, episodes)
-    flights = cartpole.fly(episodes, law, which, pushes)
+    flights = fly(episodes, law, which, pushes)
     settings, period = episodes.settings, tube.design.period
     states, nominals = flights.states[:, :-1], episodes.plans[which, :-1]
     controls = episodes.controls[which]
     begun = period * np.arange(settings.steps)
     energy, output, whole = np.zeros((3, len(which)))
     for phase in _PHASES:
-        state = hold_step(settings.system, states, flights.forces, phase * period, pushes)
+        state = hold_step(settings.system, states, flights.controls, phase * period, pushes)
         error = state - hold_step(settings.system, nominals, controls, phase * period)
         times = begun + phase * period
-        used = tube.energy(phase, error, flights.forces - controls) / tube.share(times) ** 2
+        used = tube.energy(phase, error, flights.controls - controls) / tube.share(times) ** 2
         bounds = np.stack([tube.output_radius(axis, times) for axis in np.eye(4)], axis=-1)
         energy = np.maximum(energy, used.max(axis=1))
         output = np.maximum(output, (np.abs(error) / bounds).max(axis=(1, 2)))
@@ -247,7 +258,7 @@ def ellipsoid_shares(
     return energy, output, whole, flights.fallen
 
 
-def ellipsoid_law(tube: HeldTube, episodes: cartpole.Episodes) -> cartpole.Law:
+def ellipsoid_law(tube: HeldTube, episodes: Episodes) -> Law:
     """Return the control of a tube around the plans of episodes."""
 
     def law(state: FloatArray, episode: IntArray, step: IntArray) -> FloatArray:
@@ -266,7 +277,7 @@ def ellipsoid_chunk(tube: HeldTube, chunk: int) -> dict[str, Any]:
 
     bound = _ELLIPSOID_BOUND
     law = ellipsoid_law(tube, episodes)
-    target = cartpole.CartPoleTarget(episodes, law, "tube", bound, greedy)
+    target = SingleTarget(episodes, law, "tube", bound, greedy)
     rows = {}
     for name, sequences in mixed_pushes(target, _ELLIPSOID_DRAWS, _ELLIPSOID_SEARCH).items():
         which = np.repeat(np.arange(_CHUNK), sequences.shape[1])

@@ -20,15 +20,11 @@ from rich.console import Console
 from rich.table import Table
 
 from lagros_benchmarks.run.files import write_json
-from lagros_benchmarks.tasks.cartpole.worst_case import (
-    CartPoleTarget,
-    draw_episodes,
-    energy_adversary,
-    policy_law,
-)
+from lagros_benchmarks.worst_case.flights import draw_episodes, policy_law
 from lagros_benchmarks.worst_case.optimisers import OPTIMISERS
 from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_benchmarks.worst_case.seeds import ATTACK
+from lagros_benchmarks.worst_case.single import SingleTarget, energy_adversary
 from lagros_envs.seeding import episode_seeds
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
@@ -62,7 +58,7 @@ def study(episodes: int, budget: int, runs: int = 1) -> list[dict[str, Any]]:
     law = policy_law(LagrosPolicy(expert.task), flown)
     rows = []
     for goal, bound in _PROBLEMS:
-        target = CartPoleTarget(flown, law, goal, bound, energy_adversary(expert.metric))
+        target = SingleTarget(flown, law, goal, bound, energy_adversary(expert.metric))
         for settings in methods(budget):
             begun = perf_counter()
             found = [one for run in range(runs) for one in search(target, settings, run)]

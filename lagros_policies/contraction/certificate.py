@@ -25,12 +25,13 @@ class TubeSizes:
     """Three tubes that are never to be confused, each by the radius that it tends to.
 
     Attributes:
-        paper: The published tube: a success threshold, not a bound of this package.
+        paper: The published tube: a success threshold, not a bound of this package; None where none
+            is published.
         certified: Theorem 1 with the certificate's own numbers; None where it gives no tube.
         observed: The largest ||x - x_d|| of the episodes flown; None without any.
     """
 
-    paper: float
+    paper: float | None
     certified: float | None
     observed: float | None = None
 
@@ -40,7 +41,7 @@ class Certificate:
     """What is claimed of a metric on a region.
 
     Attributes:
-        task: "cartpole" or "spacecraft".
+        task: Name of the task.
         policy: Whose learning error it counts with.
         region: Names to [low, high], where the condition holds.
         alpha: Contraction rate [1/s].
@@ -55,6 +56,12 @@ class Certificate:
         tube: The three radii.
         statements: Every claim.
         details: Further numbers, by name.
+        not_proved: What nobody has proved of it, in words.
+        verdict_radius: The tube that the certificate comes to; `tube.certified` if None.
+        reach: What that bounds, in words; "" for Theorem 1.
+        unit: Its unit; "" for the norm of the state.
+        everywhere: Whether the condition holds for all states, of which the region is a part to
+            draw from.
     """
 
     task: str
@@ -72,6 +79,16 @@ class Certificate:
     tube: TubeSizes
     statements: tuple[Statement, ...]
     details: Mapping[str, Any] = field(default_factory=dict)
+    not_proved: tuple[str, ...] = ()
+    verdict_radius: float | None = None
+    reach: str = ""
+    unit: str = ""
+    everywhere: bool = False
+
+    @property
+    def reached(self) -> float | None:
+        """The tube that the certificate comes to; None for none."""
+        return self.tube.certified if self.verdict_radius is None else self.verdict_radius
 
     @property
     def holds(self) -> bool:
@@ -109,6 +126,7 @@ class Certificate:
                 "certified": _finite(self.tube.certified),
                 "observed": _finite(self.tube.observed),
             },
+            "not_proved": list(self.not_proved),
             "holds": self.holds,
             "statements": [
                 {

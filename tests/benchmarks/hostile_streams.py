@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import lagros_benchmarks.__main__ as program
-from lagros_benchmarks.commands import certify, cli
+from lagros_benchmarks.commands import cli
 from lagros_benchmarks.report import figures
 from lagros_benchmarks.run import files, runner
+from lagros_benchmarks.tasks.spacecraft import certify as spacecraft_certify
 from lagros_benchmarks.tasks.spacecraft import scene_figure
 from lagros_benchmarks.training import curves
 from lagros_benchmarks.training import settings as training_settings
@@ -109,7 +110,7 @@ def make_small() -> None:
     runner.run_benchmark = once(runner.run_benchmark)
     runner.fly_scene = once(runner.fly_scene)
     attack.run_attack = once(attack.run_attack)
-    certify.certify_spacecraft = once(certify.certify_spacecraft)
+    spacecraft_certify.certify = once(spacecraft_certify.certify)
     demonstrations.demonstrate = once(demonstrations.demonstrate)
     for module, name in ((figures, "draw"), (curves, "draw"), (scene_figure, "scene_figure")):
         setattr(module, name, drawn_once(getattr(module, name)))

@@ -106,7 +106,7 @@ def test_a_class_that_cannot_be_searched_is_explained(
         (["cartpole", "--goal", "speed"], "goal='speed'"),
         (["cartpole", "--method", "annealing"], "method='annealing'"),
         (["cartpole", "--bound", "-1"], "bound=-1.0"),
-        (["cartpole", "--safety-filter"], "for the task spacecraft"),
+        (["cartpole", "--safety-filter"], "for worlds of many agents"),
         (["spacecraft", "--policy", "lqr"], "unknown policy 'lqr'"),
         (["cartpole", "--replay", "nowhere.npz"], "nowhere.npz"),
     ],

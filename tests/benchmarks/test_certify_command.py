@@ -12,7 +12,10 @@ from rich.cells import cell_len
 from typer.testing import CliRunner
 
 from lagros_benchmarks.commands import certify, cli
-from lagros_benchmarks.evidence import evidence as certify_evidence
+from lagros_benchmarks.evidence.single import fly_kinds, met_error, tube_line
+from lagros_benchmarks.tasks.cartpole import certify as certify_box
+from lagros_benchmarks.tasks.spacecraft.certify import AXIS_FORMAT
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.contraction import load_metric, save_metric
 from lagros_policies.contraction.certificate import Certificate, TubeSizes
 from lagros_policies.contraction.metric_files import metric_record
@@ -31,10 +34,10 @@ def invoke(tmp_path, monkeypatch):
 def quick(monkeypatch):
     """Claim the small box only, and none of the tubes that take seconds to design."""
     box = ProofBox(0.06, 0.3, 0.3, 0.3, angle_error=0.03, angular_rate_error=0.1)
-    monkeypatch.setattr(certify_evidence, "SMALL_BOX", box)
-    monkeypatch.setattr(certify_evidence, "metric_to_prove", lambda path: (path, False))
-    monkeypatch.setattr(certify_evidence, "cartpole_tubes", lambda system, bound: [])
-    monkeypatch.setattr(certify_evidence, "cartpole_held_tubes", lambda system, bound: [])
+    monkeypatch.setattr(certify_box, "SMALL_BOX", box)
+    monkeypatch.setattr(certify_box, "metric_to_prove", lambda path: (path, False))
+    monkeypatch.setattr(certify_box, "cartpole_tubes", lambda system, bound: [])
+    monkeypatch.setattr(certify_box, "cartpole_held_tubes", lambda system, bound: [])
 
 
 def test_the_spacecraft_is_certified_without_flights(invoke, tmp_path):
@@ -84,12 +87,11 @@ def test_the_cartpole_is_certified_and_a_planted_bad_metric_is_not(invoke, tmp_p
         assert not json.loads((tmp_path / f"{name}-certificate.json").read_text())["holds"]
 
 
-def certificate(*kinds, task="cartpole", certified=7.0, observed=None):
+def certificate(*kinds, certified=7.0, observed=None):
     statements = tuple(Statement("claimed", kind, True, 0.0) for kind in kinds)
     return Certificate(
-        *(task, "lagros", {"p": (-1.0, 1.0)}, 0.5, 4.0, 3.0, 1.0, 0.1, 0.75, "rates"),
+        *("cartpole", "lagros", {"p": (-1.0, 1.0)}, 0.5, 4.0, 3.0, 1.0, 0.1, 0.75, "rates"),
         *("1", np.zeros((1, 4, 4)), TubeSizes(3.15, certified, observed), statements),
-        {"tubes": {"position_held_without_learning_error": certified}},
     )
 
 
@@ -102,7 +104,11 @@ def test_the_verdict_is_one_sentence_with_what_is_proved_and_what_was_seen():
     )
     words = certify.verdict(certificate("calibrated", certified=None))
     assert words == ("Every claim holds (1 calibrated); no tube is certified; nothing was flown.")
-    words = certify.verdict(certificate("proved", task="spacecraft", certified=0.31, observed=0.1))
+    other = certificate("proved", certified=0.31, observed=0.1)
+    other = replace(
+        other, verdict_radius=0.31, reach="u* is proved to stay on its plan to", unit="m"
+    )
+    words = certify.verdict(other)
     assert words.endswith("stay on its plan to 0.31 m; the largest error flown is 0.1 m.")
     failing = certificate("proved", "observed")
     failing = replace(
@@ -167,7 +173,7 @@ _EYE = np.eye(4).tolist()
 def test_hostile_numbers_give_status_one_and_say_what_is_wrong(
     invoke, tmp_path, task, record, message
 ):
-    axis = {"format": certify_evidence.AXIS_FORMAT, "rate": 1.0, "stiffness": 3.0, "period": 0.1}
+    axis = {"format": AXIS_FORMAT, "rate": 1.0, "stiffness": 3.0, "period": 0.1}
     whole = spoiled_metric(**record) if task == "cartpole" else {**axis, **record}
     (tmp_path / "bad.json").write_text(json.dumps(whole))
     result = invoke(task, "--metric", "bad.json", "--episodes", "0")
@@ -203,7 +209,6 @@ def test_nested_brackets_without_end_are_no_metric(invoke, tmp_path):
 
 def test_the_largest_multiple_of_a_box_is_found(monkeypatch):
     """With a proof that succeeds up to a size: to a hundredth, from above and from below."""
-    from lagros_benchmarks.tasks.cartpole import certified_box as certify_box
 
     class Proof:
         def __init__(self, size, limit):
@@ -238,10 +243,9 @@ def test_the_largest_multiple_of_a_box_is_found(monkeypatch):
 
 
 def test_a_multiple_of_the_box_is_proved_as_it_is(system_of_task):
-    from lagros_benchmarks.tasks.cartpole import certified_box as certify_box
     from lagros_policies.proof.condition import prove_contraction
 
-    metric = certify_box.load_cartpole_metric(certify_evidence.metric_to_prove(None)[0])
+    metric = certify_box.load_cartpole_metric(certify_box.metric_to_prove(None)[0])
     box, first, second = certify_box.prove_multiple(metric, 0.1, 20.0)
     assert box == ProofBox.apart(0.9, 1.5, 1.5, 1.0).scaled(0.1)
     assert second.statements[-1].holds
@@ -254,7 +258,7 @@ def test_a_file_that_is_missing_gives_status_one(invoke):
 
 
 def test_a_metric_of_the_axes_can_be_read_and_a_bad_one_is_refused(invoke, tmp_path):
-    good = {"format": certify_evidence.AXIS_FORMAT, "rate": 1.0, "stiffness": 3.0, "period": 0.1}
+    good = {"format": AXIS_FORMAT, "rate": 1.0, "stiffness": 3.0, "period": 0.1}
     (tmp_path / "axis.json").write_text(json.dumps(good))
     result = invoke("spacecraft", "--metric", "axis.json", "--episodes", "0", "--json", "sc.json")
     assert result.exit_code == 0, result.output
@@ -285,14 +289,14 @@ def test_wrong_usage_gives_status_two(invoke, arguments):
 
 @pytest.mark.usefixtures("quick")
 def test_flights_add_what_was_observed(system_of_task):
-    flights = certify_evidence.fly_cartpole("lagros", 0.3, 4)
+    flights = fly_kinds(CartPoleSettings(), "lagros", 0.3, 4)
     assert flights.states.shape == (12, 91, 4)
-    error, line = certify_evidence.met_error(
-        flights, system_of_task, load_metric(), ProofBox(0.5, 9.0, 3.0, 9.0, 0.3, 2.0)
-    )
+    box = ProofBox(0.5, 9.0, 3.0, 9.0, 0.3, 2.0)
+    inside = certify_box.instants_in(box, flights)
+    error, line = met_error(CartPoleSettings(), flights, load_metric(), inside)
     assert 0.0 <= error < np.inf
     assert line.kind == "observed"
-    line, largest = certify_evidence.tube_line(flights, "lagros", 0.3)
+    line, largest = tube_line(flights, "lagros", 0.3)
     assert (line.kind, line.holds) == ("observed", True)
     error = np.linalg.norm(flights.states - flights.plans, axis=-1)
     assert largest == error[~flights.fallen].max()
@@ -302,18 +306,16 @@ def test_flights_add_what_was_observed(system_of_task):
 
 @pytest.fixture
 def system_of_task():
-    from lagros_envs.tasks.cartpole.task import CartPoleSettings
-
     return CartPoleSettings().system
 
 
 def test_flights_that_serve_several_bounds_are_timed_once(monkeypatch):
     from lagros_benchmarks.evidence import calibration
 
-    values = {one.name: np.arange(40.0) for one in calibration.CARTPOLE_SCORES}
+    values = {one.name: np.arange(40.0) for one in calibration.scores_of(CartPoleSettings())}
     scores = calibration.EpisodeScores(values, 0, 6.0)
-    monkeypatch.setattr(calibration, "cartpole_scores", lambda *_, **__: scores)
-    lines = calibration.cartpole_statements(0.95, 40)
+    monkeypatch.setattr(calibration, "single_scores", lambda *_, **__: scores)
+    lines = calibration.single_statements(CartPoleSettings(), 0.95, 40)
     assert len(lines) == 3
     assert sum(line.seconds for line in lines) == pytest.approx(6.0)
 

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 import lagros_policies
-from lagros_benchmarks.tasks.spacecraft.claims import position_margin
 from lagros_benchmarks.report.records import summarise
 from lagros_benchmarks.report.tables import csv_text
 from lagros_benchmarks.run.runner import run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_benchmarks.tasks.spacecraft.claims import position_margin
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.double_integrator import certified_margin

@@ -61,7 +61,7 @@ def test_a_network_that_changed_is_flown_again(
         flown.append(1)
         return EpisodeScores({"tube": np.array([1.0, float(len(flown)), np.inf])}, 1, 0.5)
 
-    monkeypatch.setattr(conformal, "cartpole_scores", scores)
+    monkeypatch.setattr(conformal, "single_scores", scores)
     case = {"task": "cartpole", "policy": "lagros", "kind": "uniform", "bound": 0.75}
     first, _ = conformal.scores_of(case, 1, 3, Path("runs"))
     again, _ = conformal.scores_of(case, 1, 3, Path("runs"))

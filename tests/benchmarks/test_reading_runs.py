@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from lagros_benchmarks.commands import cli
-from lagros_benchmarks.evidence.evidence import load_axis_metric
 from lagros_benchmarks.run.files import plain
+from lagros_benchmarks.tasks.spacecraft.certify import load_axis_metric
 from lagros_benchmarks.training.run import Place, train
 from lagros_benchmarks.training.settings import CartPoleTraining
 from lagros_benchmarks.worst_case import attack
@@ -26,6 +26,7 @@ from lagros_benchmarks.worst_case.replay import (
     save_worst_cases,
 )
 from lagros_benchmarks.worst_case.search import SearchSettings
+from lagros_benchmarks.worst_case.single import SingleBench
 from lagros_policies.learning.shards import claim, make_shards
 
 FUZZ = settings(
@@ -60,7 +61,7 @@ def value_or_line(read, path: Path):
 def record() -> dict:
     from dataclasses import asdict
 
-    command = AttackSettings(policy="lqr", episodes=1, search=SearchSettings(budget=9))
+    command = AttackSettings("cartpole", policy="lqr", episodes=1, search=SearchSettings(budget=9))
     outcome = Outcome(5, 0.5, False, {"success": True, "error": None})
     return {
         "format": "lagros-worst-case-1",
@@ -82,15 +83,15 @@ def write(path: Path, text: object, pushes: object = None) -> Path:
 def grounded(monkeypatch):
     """The command `attack --replay` up to its flights, which do what the file says."""
 
-    class Bench:
-        def __init__(self, asked):
-            assert isinstance(asked, AttackSettings)
+    class Bench(SingleBench):
+        def prepare(self, say):
+            assert isinstance(self.settings, AttackSettings)
 
         def replay(self, pushes):
             assert pushes.shape == (1, 90, 4)
             return [Outcome(5, 0.5, False, {"success": True, "error": None})]
 
-    monkeypatch.setattr(attack, "_CartPoleBench", Bench)
+    monkeypatch.setattr(attack, "bench_of", lambda task: Bench)
     command = cli.typer.main.get_command(cli.app)
     monkeypatch.setattr("typer.testing._get_command", lambda _: command)
 

@@ -13,17 +13,13 @@ import pytest
 from typer.testing import CliRunner
 
 from lagros_benchmarks.commands import cli
-from lagros_benchmarks.evidence.calibration import cartpole_scores
+from lagros_benchmarks.evidence.calibration import single_scores
 from lagros_benchmarks.run.flying import AnswerError, Attempt, ask, describe_error
 from lagros_benchmarks.run.runner import run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings
-from lagros_benchmarks.tasks.cartpole.worst_case import (
-    GOALS,
-    draw_episodes,
-    fly,
-    policy_law,
-    scores,
-)
+from lagros_benchmarks.worst_case.flights import draw_episodes, fly, policy_law
+from lagros_benchmarks.worst_case.goals import GOALS, scores
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 from tests.benchmarks import strangers
 
@@ -229,7 +225,7 @@ def test_an_answer_is_a_copy_of_the_right_shape():
 
 @pytest.mark.parametrize("kind", [strangers.Raises, strangers.Leaves, strangers.NotANumber])
 def test_a_calibration_counts_what_raises_as_infinitely_far(kind):
-    found = cartpole_scores(name_of(kind), 3)
+    found = single_scores(CartPoleSettings(), name_of(kind), 3)
     assert found.failed == 3
     assert all(np.isinf(values).all() for values in found.values.values())
 
@@ -246,6 +242,6 @@ def test_a_search_finds_what_makes_a_policy_raise():
     law = policy_law(Picky(None), episodes)
     every = np.arange(3)
     flown = fly(episodes, law, every, np.zeros((3, episodes.settings.steps, 4)))
-    assert np.isnan(flown.forces).any(axis=(1, 2)).tolist() == [False, True, False]
+    assert np.isnan(flown.controls).any(axis=(1, 2)).tolist() == [False, True, False]
     for goal in GOALS:
         assert np.isinf(scores(episodes, goal, every, flown)[0]).tolist() == [False, True, False]

@@ -14,17 +14,22 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401
-from lagros_benchmarks.tasks.cartpole import worst_case as cartpole
 from lagros_benchmarks.worst_case.attack import AttackSettings, fly_again, run_attack
 from lagros_benchmarks.worst_case.certificate import TubeCheck
-from lagros_benchmarks.worst_case.optimisers import OPTIMISERS, make_search
-from lagros_benchmarks.worst_case.replay import (
-    load_worst_cases,
-    replay_cartpole,
-    save_worst_cases,
+from lagros_benchmarks.worst_case.flights import (
+    Episodes,
+    Flights,
+    draw_episodes,
+    fly,
+    policy_law,
+    tracking_law,
 )
+from lagros_benchmarks.worst_case.goals import GOALS, gradient, scores
+from lagros_benchmarks.worst_case.optimisers import OPTIMISERS, make_search
+from lagros_benchmarks.worst_case.replay import load_worst_cases, save_worst_cases
 from lagros_benchmarks.worst_case.search import METHODS, SearchSettings, search
 from lagros_benchmarks.worst_case.sequences import PARAMETRISATIONS, Knots, Replay, Segments
+from lagros_benchmarks.worst_case.single import replay_single
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
 from lagros_policies.baselines import LqrPolicy
@@ -41,8 +46,8 @@ def expert() -> CartPoleExpert:
 
 
 @pytest.fixture(scope="module")
-def episodes(expert: CartPoleExpert) -> cartpole.Episodes:
-    return cartpole.draw_episodes(expert, episode_seeds(0, 3, 12345))
+def episodes(expert: CartPoleExpert) -> Episodes:
+    return draw_episodes(expert, episode_seeds(0, 3, 12345))
 
 
 @given(
@@ -163,9 +168,9 @@ def test_settings_name_what_is_wrong() -> None:
     with pytest.raises(ValueError, match="population=1 must be a whole number"):
         SearchSettings(population=1)
     with pytest.raises(ValueError, match="goal='speed'"):
-        AttackSettings(goal="speed")
+        AttackSettings("cartpole", goal="speed")
     with pytest.raises(ValueError, match="random"):
-        AttackSettings(policy="random")
+        AttackSettings("cartpole", policy="random")
     with pytest.raises(ValueError, match="optimiser 'x'"):
         make_search("x", 2, 2, np.random.default_rng(0))
 
@@ -177,12 +182,10 @@ def _pushes(count: int, bound: float) -> FloatArray:
 
 
 @pytest.mark.parametrize("policy", [LqrPolicy(), LagrosPolicy()], ids=["lqr", "lagros"])
-def test_flights_are_those_of_the_vector_environment(
-    policy: Any, episodes: cartpole.Episodes
-) -> None:
+def test_flights_are_those_of_the_vector_environment(policy: Any, episodes: Episodes) -> None:
     pushes = _pushes(3, 0.2)
-    law = cartpole.policy_law(policy, episodes)
-    flights = cartpole.fly(episodes, law, np.arange(3), pushes)
+    law = policy_law(policy, episodes)
+    flights = fly(episodes, law, np.arange(3), pushes)
     env = CartPoleVectorEnv(
         3, Replay(np.moveaxis(pushes, 1, 0), 0.1), 0.2, autoreset_mode="disabled"
     )
@@ -195,30 +198,26 @@ def test_flights_are_those_of_the_vector_environment(
     np.testing.assert_allclose(flights.states, np.stack(states, axis=1), atol=1e-5)
 
 
-def test_the_stand_in_of_tube_mpc_is_tube_mpc(
-    expert: CartPoleExpert, episodes: cartpole.Episodes
-) -> None:
+def test_the_stand_in_of_tube_mpc_is_tube_mpc(expert: CartPoleExpert, episodes: Episodes) -> None:
     pushes = _pushes(3, 0.2)
-    law = cartpole.tracking_law(expert, episodes)
-    flight = cartpole.fly(episodes, law, np.arange(3), pushes)
+    law = tracking_law(expert, episodes)
+    flight = fly(episodes, law, np.arange(3), pushes)
     policy = TubeMpcPolicy(deadline=1e9)
-    outcome, real = replay_cartpole(episodes, 0, policy, "tube", pushes[0])
+    outcome, real = replay_single(episodes, 0, policy, "tube", pushes[0])
     assert real is not None
     np.testing.assert_allclose(real.states[0], flight.states[0], atol=2e-3)
-    score = cartpole.scores(episodes, "tube", np.arange(3), flight)[0][0]
+    score = scores(episodes, "tube", np.arange(3), flight)[0][0]
     assert outcome.score == pytest.approx(score, rel=1e-2)
 
 
-@pytest.mark.parametrize("goal", cartpole.GOALS)
-def test_slopes_against_differences_of_whole_flights(
-    goal: str, episodes: cartpole.Episodes
-) -> None:
-    law = cartpole.policy_law(_Exact(episodes), episodes)
+@pytest.mark.parametrize("goal", GOALS)
+def test_slopes_against_differences_of_whole_flights(goal: str, episodes: Episodes) -> None:
+    law = policy_law(_Exact(episodes), episodes)
     where = np.array([1])
     pushes = _pushes(1, 0.3)
-    flight = cartpole.fly(episodes, law, where, pushes)
-    value, instant = cartpole.scores(episodes, goal, where, flight)
-    slope = cartpole.gradient(episodes, law, goal, where, pushes, flight)[0]
+    flight = fly(episodes, law, where, pushes)
+    value, instant = scores(episodes, goal, where, flight)
+    slope = gradient(episodes, law, goal, where, pushes, flight)[0]
     assert not slope[instant[0] :].any()
     rng = np.random.default_rng(3)
     for _ in range(2):
@@ -226,9 +225,7 @@ def test_slopes_against_differences_of_whole_flights(
         # Observations and actions are rounded to float32.
         step = 1e-4
         ends = [
-            cartpole.scores(
-                episodes, goal, where, cartpole.fly(episodes, law, where, pushes + sign * change)
-            )[0][0]
+            scores(episodes, goal, where, fly(episodes, law, where, pushes + sign * change))[0][0]
             for sign in (step, -step)
         ]
         measured = (ends[0] - ends[1]) / (2.0 * step)
@@ -242,14 +239,14 @@ def test_slopes_against_differences_of_whole_flights(
 class _Exact:
     """LQR in double precision at the float32 state that is shown, without float32 actions."""
 
-    def __init__(self, episodes: cartpole.Episodes) -> None:
+    def __init__(self, episodes: Episodes) -> None:
         self._policy = LqrPolicy(episodes.settings)
 
     def predict(self, rows: Any, *_: Any) -> tuple[Any, None]:
         return self._policy.predict(rows)[0], None
 
 
-def _factor(episodes: cartpole.Episodes, goal: str, flight: cartpole.Flights, at: int) -> float:
+def _factor(episodes: Episodes, goal: str, flight: Flights, at: int) -> float:
     state = flight.states[0, at]
     if goal == "clearance":
         return 1.0
@@ -259,13 +256,13 @@ def _factor(episodes: cartpole.Episodes, goal: str, flight: cartpole.Flights, at
     return 1.0 / float(np.linalg.norm(state - episodes.plans[1, at]) * radius)
 
 
-def test_a_policy_with_a_memory_is_refused(episodes: cartpole.Episodes) -> None:
-    law = cartpole.policy_law(TubeMpcPolicy(deadline=1e9), episodes)
+def test_a_policy_with_a_memory_is_refused(episodes: Episodes) -> None:
+    law = policy_law(TubeMpcPolicy(deadline=1e9), episodes)
     with pytest.raises(ValueError, match="keeps a memory"):
         law(episodes.initial_states, np.arange(3), np.zeros(3, int))
 
 
-def test_replay_is_the_given_sequence(episodes: cartpole.Episodes) -> None:
+def test_replay_is_the_given_sequence(episodes: Episodes) -> None:
     pushes = _pushes(1, 0.4)[0]
     env: Any = gym.make(
         "lagros/CartPole-v0", disturbance=Replay(pushes, 0.1), disturbance_bound=0.4
@@ -278,12 +275,12 @@ def test_replay_is_the_given_sequence(episodes: cartpole.Episodes) -> None:
 
 
 def test_a_certificate_that_is_too_small_is_crossed(
-    expert: CartPoleExpert, episodes: cartpole.Episodes
+    expert: CartPoleExpert, episodes: Episodes
 ) -> None:
-    law = cartpole.tracking_law(expert, episodes)
+    law = tracking_law(expert, episodes)
     pushes = np.zeros((3, 90, 4))
     pushes[:, :, 2] = 0.05
-    flight = cartpole.fly(episodes, law, np.arange(3), pushes)
+    flight = fly(episodes, law, np.arange(3), pushes)
     every = np.arange(3)
     honest = TubeCheck(expert, episodes, 0.05).hold(every, flight)
     assert honest.in_region.any()
@@ -293,7 +290,7 @@ def test_a_certificate_that_is_too_small_is_crossed(
     wrong = TubeCheck(expert, episodes, 0.0).hold(every, flight)
     assert wrong.certified_crossed.all()
     # A policy that ignores the plan has a learning error, and the certificate takes it in.
-    lqr = cartpole.fly(episodes, cartpole.policy_law(LqrPolicy(), episodes), every, pushes)
+    lqr = fly(episodes, policy_law(LqrPolicy(), episodes), every, pushes)
     other = TubeCheck(expert, episodes, 0.05).hold(every, lqr)
     assert (other.certified_radius > 2.0 * honest.certified_radius).all()
     assert other.observed(0)["learning_error"] > 0.1
@@ -305,7 +302,11 @@ def test_a_certificate_that_is_too_small_is_crossed(
 
 def test_an_attack_is_saved_and_flown_again_to_the_last_bit(tmp_path: Path) -> None:
     given = AttackSettings(
-        goal="success", bound=0.75, episodes=2, search=SearchSettings(budget=80, population=20)
+        "cartpole",
+        goal="success",
+        bound=0.75,
+        episodes=2,
+        search=SearchSettings(budget=80, population=20),
     )
     attack = run_attack(given)
     row = attack.row

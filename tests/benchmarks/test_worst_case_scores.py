@@ -14,17 +14,31 @@ from numpy.typing import NDArray
 import lagros_envs  # noqa: F401
 import lagros_policies
 from lagros_benchmarks.evidence import calibration
-from lagros_benchmarks.tasks.cartpole import worst_case as cartpole
+from lagros_benchmarks.tasks.spacecraft import calibration as worlds_calibration
+from lagros_benchmarks.tasks.spacecraft.attack import (
+    SpacecraftBench,
+    replay_spacecraft,
+    search_adversary,
+)
 from lagros_benchmarks.tasks.spacecraft.plane import plane_target, worst_plane_pushes
 from lagros_benchmarks.tasks.spacecraft.worst_case import SpacecraftFlights, SpacecraftTarget
 from lagros_benchmarks.worst_case import attack
 from lagros_benchmarks.worst_case.attack import AttackSettings, check_bound, run_attack
-from lagros_benchmarks.worst_case.certificate import CertificateTarget, TubeCheck
-from lagros_benchmarks.worst_case.replay import Outcome, replay_cartpole, replay_spacecraft
+from lagros_benchmarks.worst_case.certificate import TubeCheck
+from lagros_benchmarks.worst_case.flights import Episodes, Flights, draw_episodes, fly, tracking_law
+from lagros_benchmarks.worst_case.goals import GOALS, scores
+from lagros_benchmarks.worst_case.replay import Outcome
 from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_benchmarks.worst_case.seeds import ATTACK, CALIBRATION
+from lagros_benchmarks.worst_case.single import (
+    CertificateTarget,
+    SingleTarget,
+    energy_adversary,
+    replay_single,
+)
 from lagros_envs.conventions import beyond_the_end
 from lagros_envs.seeding import EVALUATION, episode_seeds
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.baselines import LqrPolicy
 from lagros_policies.contraction import certified_tube
@@ -41,31 +55,29 @@ def expert() -> CartPoleExpert:
 
 
 @pytest.fixture(scope="module")
-def episodes(expert: CartPoleExpert) -> cartpole.Episodes:
-    return cartpole.draw_episodes(expert, episode_seeds(0, 3, 12345))
+def episodes(expert: CartPoleExpert) -> Episodes:
+    return draw_episodes(expert, episode_seeds(0, 3, 12345))
 
 
 # The cart-pole: what a flight is scored by.
 
 
-def test_targets_fly_sequences_times_the_bound(
-    expert: CartPoleExpert, episodes: cartpole.Episodes
-) -> None:
-    law = cartpole.tracking_law(expert, episodes)
-    target = cartpole.CartPoleTarget(episodes, law, "tube", 0.2)
+def test_targets_fly_sequences_times_the_bound(expert: CartPoleExpert, episodes: Episodes) -> None:
+    law = tracking_law(expert, episodes)
+    target = SingleTarget(episodes, law, "tube", 0.2)
     still = np.zeros((3, 90, 4))
     still[..., 2] = 1.0
-    flown = cartpole.fly(episodes, law, np.arange(3), 0.2 * still)
-    wanted = cartpole.scores(episodes, "tube", np.arange(3), flown)[0]
+    flown = fly(episodes, law, np.arange(3), 0.2 * still)
+    wanted = scores(episodes, "tube", np.arange(3), flown)[0]
     np.testing.assert_array_equal(target.scores(np.arange(3), still), wanted)
 
 
 def test_starts_push_both_ways_along_every_axis_and_away_from_the_plan(
-    expert: CartPoleExpert, episodes: cartpole.Episodes
+    expert: CartPoleExpert, episodes: Episodes
 ) -> None:
-    law = cartpole.tracking_law(expert, episodes)
-    adversary = cartpole.energy_adversary(expert.metric)
-    target = cartpole.CartPoleTarget(episodes, law, "tube", 0.1, adversary)
+    law = tracking_law(expert, episodes)
+    adversary = energy_adversary(expert.metric)
+    target = SingleTarget(episodes, law, "tube", 0.1, adversary)
     starts = target.starts()
     assert starts.shape == (3, 9, 90, 4)
     assert [one.flights for one in search(target, SearchSettings("random", budget=4))] == [4] * 3
@@ -73,25 +85,32 @@ def test_starts_push_both_ways_along_every_axis_and_away_from_the_plan(
     axes = np.concatenate([np.eye(4), -np.eye(4)])
     assert constant == {tuple(row) for row in axes}
     # The greedy pushes raise V = e'Me: where there is an error they go along its gradient.
-    flights = cartpole.fly(episodes, law, np.arange(3), 0.1 * starts[:, 8])
+    flights = fly(episodes, law, np.arange(3), 0.1 * starts[:, 8])
     error = (flights.states - episodes.plans)[:, 1:90]
     gradient = np.einsum("eij,ej->ei", expert.metric.matrix(flights.states[0, 1:90]), error[0])
     assert np.all(np.sum(gradient * starts[0, 8, 1:], axis=-1) > 0.0)
 
 
 def test_a_fall_counts_for_the_clearance_and_the_moment_of_it_for_nothing_else(
-    episodes: cartpole.Episodes,
+    episodes: Episodes,
 ) -> None:
     states = episodes.plans[:1].copy()
     states[0, 50:] = [0.0, 2.0, 0.0, 900.0]
     alive = np.ones((1, 91), bool)
     alive[0, 51:] = False
-    flight = cartpole.Flights(states, np.zeros((1, 90, 1)), alive, np.ones(1, bool))
+    flight = Flights(
+        states,
+        np.zeros((1, 90, 1)),
+        alive,
+        np.ones(1, bool),
+        np.zeros(1, bool),
+        np.full((1, 91), np.inf),
+    )
     where = np.zeros(1, int)
-    depth, instant = cartpole.scores(episodes, "clearance", where, flight)
+    depth, instant = scores(episodes, "clearance", where, flight)
     assert (depth[0], instant[0]) == (pytest.approx(2.0 - np.pi / 2), 50)
     # On the plan until it fell.
-    assert cartpole.scores(episodes, "tube", where, flight)[0][0] == pytest.approx(0.0, abs=1e-6)
+    assert scores(episodes, "tube", where, flight)[0][0] == pytest.approx(0.0, abs=1e-6)
 
 
 class _Still:
@@ -101,24 +120,24 @@ class _Still:
         return np.zeros((*np.shape(rows)[:-1], 1), np.float32), None
 
 
-def test_what_counts_as_broken_on_the_cartpole(episodes: cartpole.Episodes) -> None:
+def test_what_counts_as_broken_on_the_cartpole(episodes: Episodes) -> None:
     push = np.zeros((90, 4))
     push[:20, 0] = 2.0
 
     def broken(policy: Any, goal: str) -> bool:
-        return replay_cartpole(episodes, 0, policy, goal, push)[0].broken
+        return replay_single(episodes, 0, policy, goal, push)[0].broken
 
     # Without a force the pole falls: everything is broken.
-    assert [broken(_Still(), goal) for goal in cartpole.GOALS] == [True] * 3
+    assert [broken(_Still(), goal) for goal in GOALS] == [True] * 3
     # LQR is pushed out of the tube around the plan and arrives all the same.
-    assert [broken(LqrPolicy(), goal) for goal in cartpole.GOALS] == [True, False, False]
+    assert [broken(LqrPolicy(), goal) for goal in GOALS] == [True, False, False]
 
 
 def test_the_tube_is_held_until_the_first_instant_outside_the_region(
-    expert: CartPoleExpert, episodes: cartpole.Episodes
+    expert: CartPoleExpert, episodes: Episodes
 ) -> None:
-    law = cartpole.tracking_law(expert, episodes)
-    flight = cartpole.fly(episodes, law, np.array([0]), np.zeros((1, 90, 4)))
+    law = tracking_law(expert, episodes)
+    flight = fly(episodes, law, np.array([0]), np.zeros((1, 90, 4)))
     check = TubeCheck(expert, episodes, 0.05)
     before = check.hold(np.array([0]), flight)
     steady = certified_tube(expert.metric, 0.05).steady_radius
@@ -140,9 +159,9 @@ def test_the_tube_is_held_until_the_first_instant_outside_the_region(
 def test_a_search_for_the_share_of_the_certificate_is_no_worse_than_its_starts(
     expert: CartPoleExpert,
 ) -> None:
-    episodes = cartpole.draw_episodes(expert, episode_seeds(0, 1, 12345))
-    law = cartpole.tracking_law(expert, episodes)
-    adversary = cartpole.energy_adversary(expert.metric)
+    episodes = draw_episodes(expert, episode_seeds(0, 1, 12345))
+    law = tracking_law(expert, episodes)
+    adversary = energy_adversary(expert.metric)
     check = TubeCheck(expert, episodes, 0.75)
     target = CertificateTarget(episodes, law, "tube", 0.75, adversary, check)
     found = search(target, SearchSettings("cross-entropy", budget=20, population=10))
@@ -150,13 +169,15 @@ def test_a_search_for_the_share_of_the_certificate_is_no_worse_than_its_starts(
     for index, one in enumerate(found):
         flown = target.scores(np.full(9, index), starts[index])
         assert one.score >= flown.max()
-        again = cartpole.fly(episodes, law, np.array([index]), 0.75 * one.sequence[None])
+        again = fly(episodes, law, np.array([index]), 0.75 * one.sequence[None])
         assert check.hold(np.array([index]), again).certified_share[0] == one.score
 
 
 def test_a_metric_that_is_a_network_is_attacked_by_the_law_of_its_own() -> None:
     name = "lagros_policies.remarks.policies:NeuralTubeMpcPolicy"
-    given = AttackSettings(policy=name, bound=0.3, episodes=1, search=SearchSettings(budget=30))
+    given = AttackSettings(
+        "cartpole", policy=name, bound=0.3, episodes=1, search=SearchSettings(budget=30)
+    )
     row = run_attack(given).row
     assert row["broken_rate"] == 1.0
     assert row["random_broken_rate"] == 0.0
@@ -169,7 +190,7 @@ def test_a_metric_that_is_a_network_is_attacked_by_the_law_of_its_own() -> None:
 
 
 def test_attacks_have_episodes_of_their_own() -> None:
-    seeds = AttackSettings(episodes=50, seed=3).episode_seeds()
+    seeds = AttackSettings("cartpole", episodes=50, seed=3).episode_seeds()
     assert seeds == episode_seeds(3, 50, ATTACK)
     for other in (None, EVALUATION, CALIBRATION):
         assert not set(seeds) & set(episode_seeds(3, 50, other))
@@ -204,7 +225,7 @@ def test_the_search_of_an_adversary_keeps_the_worst_that_it_flew() -> None:
     target: Any = SimpleNamespace(try_adversaries=fly, bound=1.0)
     rng = np.random.default_rng(0)
     given = SearchSettings(budget=100, population=16)
-    found = attack._search_adversary(target, given, rng)
+    found = search_adversary(target, given, rng)
     assert found.score == max(points[:, 0].max() for points in flown)
     assert found.sequence[0, 0, 0] == found.score
     assert found.flights == sum(map(len, flown)) <= 100
@@ -214,12 +235,14 @@ def test_the_filter_is_worn_and_has_no_certified_margin() -> None:
     given = AttackSettings(
         "spacecraft", "centralized", "clearance", 0.4, 1, preset="open", agents=2
     )
-    bare, worn = (attack._targets(replace(given, safety_filter=flag))[0] for flag in (False, True))
+    bare, worn = (
+        SpacecraftBench(replace(given, safety_filter=flag)).targets()[0] for flag in (False, True)
+    )
     assert bare.margin is not None
     assert worn.margin is None
     assert isinstance(worn.policy, SafetyFilter)
     # A policy that prepares for a bound is told the one that it is attacked with.
-    stronger = attack._targets(replace(given, bound=0.8))[0]
+    stronger = SpacecraftBench(replace(given, bound=0.8)).targets()[0]
     assert stronger.policy.planner.settings.margins[0] == pytest.approx(  # type: ignore[attr-defined]
         2.0 * bare.policy.planner.settings.margins[0]  # type: ignore[attr-defined]
     )
@@ -332,13 +355,13 @@ def test_an_attack_on_the_certified_error_comes_near_it_within_the_ball() -> Non
 
 
 def test_calibration_scores_are_the_largest_of_an_episode(expert: CartPoleExpert) -> None:
-    scores = calibration.cartpole_scores("lagros", 2, bound=0.5).values
+    scores = calibration.single_scores(CartPoleSettings(), "lagros", 2, bound=0.5).values
     env: Any = gym.make(
         "lagros/CartPole-v0", disturbance="uniform", disturbance_bound=0.5
     ).unwrapped
     policy = lagros_policies.make("lagros", env)
     for index, seed in enumerate(episode_seeds(0, 2, CALIBRATION)):
-        one = cartpole.draw_episodes(expert, [seed])
+        one = draw_episodes(expert, [seed])
         tracked = expert.track(one.plans, one.controls)
         rows, _ = env.reset(seed=seed)
         errors, missed = [0.0], []
@@ -356,14 +379,14 @@ def test_calibration_scores_are_the_largest_of_an_episode(expert: CartPoleExpert
 def test_episodes_that_fall_or_have_no_plan_are_infinitely_bad(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    fallen = calibration.cartpole_scores("lagros", 4, bound=20.0)
+    fallen = calibration.single_scores(CartPoleSettings(), "lagros", 4, bound=20.0)
     assert fallen.failed == 4
     assert all(np.all(np.isinf(values)) for values in fallen.values.values())
     drawn = calibration.draw_episodes
     monkeypatch.setattr(
         calibration, "draw_episodes", lambda *given: replace(drawn(*given), unplanned=(1, 2))
     )
-    some = calibration.cartpole_scores("lagros", 3, bound=0.1)
+    some = calibration.single_scores(CartPoleSettings(), "lagros", 3, bound=0.1)
     assert some.failed == 2
     assert all(
         np.isinf(values).tolist() == [False] * 3 + [True] * 2 for values in some.values.values()
@@ -384,8 +407,8 @@ def test_a_world_scores_its_worst_agent_and_a_failed_one_is_infinitely_bad(
         world(0.1, 0.1, error="it raised"),
         world(0.1, 0.1, planned=False),
     ]
-    monkeypatch.setattr(calibration, "fly_chunk", lambda *_: SimpleNamespace(worlds=worlds))
-    scores = calibration.spacecraft_scores(5, preset="open", agents=2)
+    monkeypatch.setattr(worlds_calibration, "fly_chunk", lambda *_: SimpleNamespace(worlds=worlds))
+    scores = worlds_calibration.spacecraft_scores(5, preset="open", agents=2)
     np.testing.assert_array_equal(
         scores.values["position_error"], [0.3, 0.4, np.inf, np.inf, np.inf]
     )

@@ -9,6 +9,8 @@ import pytest
 
 import lagros_policies
 from lagros_benchmarks.evidence import calibration
+from lagros_benchmarks.tasks.spacecraft.attack import replay_spacecraft
+from lagros_benchmarks.tasks.spacecraft.calibration import spacecraft_scores
 from lagros_benchmarks.tasks.spacecraft.worst_case import (
     PARAMETERS,
     Adversary,
@@ -17,10 +19,10 @@ from lagros_benchmarks.tasks.spacecraft.worst_case import (
     first_adversaries,
     least_gap,
 )
-from lagros_benchmarks.worst_case.replay import replay_spacecraft
 from lagros_benchmarks.worst_case.seeds import ATTACK, CALIBRATION, VERIFICATION
 from lagros_envs.disturbances import Situation
 from lagros_envs.seeding import EVALUATION, episode_seeds
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.conformal import rank_for
@@ -127,23 +129,23 @@ def test_namespaces_share_no_episode() -> None:
 
 
 def test_scores_of_the_cartpole_are_those_of_its_flights() -> None:
-    scores = calibration.cartpole_scores("lagros", 12, bound=0.3)
+    scores = calibration.single_scores(CartPoleSettings(), "lagros", 12, bound=0.3)
     tube, share = scores.values["tube"], scores.values["tube_share"]
     assert scores.failed == 0
     assert {len(values) for values in scores.values.values()} == {12}
     # ||e|| <= s r(t) with r(t) < 3.15.
     assert np.all(tube <= 3.15 * share)
     # Ten times the disturbance, the same episodes: none is closer to its plan.
-    more = calibration.cartpole_scores("lagros", 12, bound=3.0)
+    more = calibration.single_scores(CartPoleSettings(), "lagros", 12, bound=3.0)
     assert np.all(more.values["tube"] > tube)
-    still = calibration.cartpole_scores("tube-mpc", 4, kind="none", bound=0.0)
+    still = calibration.single_scores(CartPoleSettings(), "tube-mpc", 4, kind="none", bound=0.0)
     assert still.values["learning_error"].max() < 1e-3
 
 
 def test_statements_need_enough_episodes_for_the_level() -> None:
     with pytest.raises(ValueError, match="too few"):
-        calibration.cartpole_statements(0.95, 5, bound=0.3)
-    lines = calibration.cartpole_statements(0.5, 5, bound=0.3)
+        calibration.single_statements(CartPoleSettings(), 0.95, 5, bound=0.3)
+    lines = calibration.single_statements(CartPoleSettings(), 0.5, 5, bound=0.3)
     assert rank_for(5, 0.5) == 3
     assert [line.kind for line in lines] == ["calibrated"] * 3
     assert all(line.holds for line in lines)
@@ -153,7 +155,7 @@ def test_scores_of_the_spacecraft_stay_below_the_certified_margin() -> None:
     from lagros_policies.contraction.double_integrator import certified_margin
     from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
 
-    scores = calibration.spacecraft_scores(3, bound=0.4, preset="open", agents=2)
+    scores = spacecraft_scores(3, bound=0.4, preset="open", agents=2)
     margin = certified_margin(CentralizedPolicy(preset="open").tracking.plane, 0.4)
     assert np.all(scores.values["position_error"] < margin)
     assert np.all(scores.values["position_error"] > 0.0)

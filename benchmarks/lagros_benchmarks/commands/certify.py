@@ -19,79 +19,77 @@ if TYPE_CHECKING:
 
     from lagros_policies.contraction.certificate import Certificate
 
-# The policies that Theorem 1 speaks of: a network that imitates u*, and u* itself.
-POLICIES = {"cartpole": ("lagros", "tube-mpc"), "spacecraft": ("lagros", "centralized")}
-BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
-_EPISODES = {"cartpole": 400, "spacecraft": 20}
 _MOST_EPISODES = 1_000_000
 _WIDTH = 80
-# alpha of the spacecraft's policies, in the plane and of the heading [1/s].
-_PLANE_RATE, _TURNING_RATE = 2.0, 0.3
-# Episodes that a bound of probability 0.95 needs.
-_LEAST = 19
 _CHANNELS = {"all": "all states disturbed", "rates": "the rates disturbed, not the positions"}
 
 
 def certify(
-    task: Annotated[str, typer.Argument(help="cartpole or spacecraft.")],
+    task: Annotated[str, typer.Argument(help="As for `lagros bench`.")],
     metric: Annotated[
         Path | None,
         typer.Option(metavar="FILE", dir_okay=False, help="A metric of your own; ours if not."),
     ] = None,
     policy: Annotated[
-        str,
-        typer.Option(help="lagros; or u* itself: cartpole tube-mpc, spacecraft centralized."),
-    ] = "lagros",
+        str | None,
+        typer.Option(
+            metavar="NAME", help="lagros, or u* itself: tube-mpc of one body, centralized of many."
+        ),
+    ] = None,
     json: Annotated[
         Path | None, typer.Option(metavar="FILE", dir_okay=False, help="Write the certificate.")
     ] = None,
-    bound: Annotated[float | None, typer.Option(help="d̄; cartpole 0.75, spacecraft 0.4.")] = None,
+    bound: Annotated[float | None, typer.Option(help="d̄; the task's own if not given.")] = None,
     episodes: Annotated[
         int | None,
-        typer.Option(help="Episodes (worlds) flown; cartpole 400, spacecraft 20; 0 for none."),
+        typer.Option(help="Episodes (worlds) flown; the task's own if not given, 0 for none."),
     ] = None,
     seconds: Annotated[float, typer.Option(help="Time for each search for a proof, in s.")] = 60.0,
     largest: Annotated[
         bool,
-        typer.Option(
-            "--largest", help="Cart-pole: claim the largest multiple of the region that is proved."
-        ),
+        typer.Option("--largest", help="Claim the largest multiple of the region that is proved."),
     ] = False,
 ) -> None:
     """Print one certificate: region, α, χ, tube, and which kind each claim is.
 
     Ends with status 1 if anything that it claims does not hold.
     """
-    from lagros_benchmarks.run.settings import check_task
+    from lagros_benchmarks.evidence.single import Question, UnservedError
+    from lagros_benchmarks.run.room import room_of
     from lagros_envs.checks import check_disturbance_bound, check_positive, check_whole, shown
     from lagros_envs.reading import check_file
+    from lagros_envs.registry import task_named
 
     try:
-        check_task(task)
-        if policy not in POLICIES[task]:
+        described = task_named(task)
+        defaults = described.defaults
+        asked = defaults.certify_policies[0] if policy is None else policy
+        if asked not in defaults.certify_policies:
             raise ValueError(
-                f"--policy: {shown(policy)} must be one of {', '.join(POLICIES[task])}: the "
-                "theorems speak of u* and of what imitates it"
+                f"--policy: {shown(asked)} must be one of {', '.join(defaults.certify_policies)}: "
+                "the theorems speak of u* and of what imitates it"
             )
-        if bound is not None:
-            check_positive("bound", bound)
-            check_disturbance_bound("bound", bound)
-        if episodes is not None:
-            check_whole("episodes", episodes, 0, _MOST_EPISODES)
+        question = Question(
+            policy=asked,
+            bound=defaults.bound if bound is None else bound,
+            episodes=defaults.certify_episodes if episodes is None else episodes,
+            metric=metric,
+            seconds=seconds,
+            largest=largest,
+        )
+        check_positive("bound", question.bound)
+        check_disturbance_bound("bound", question.bound)
+        check_whole("episodes", question.episodes, 0, _MOST_EPISODES)
         check_positive("seconds", seconds)
-        if largest and task != "cartpole":
-            raise ValueError("--largest: the spacecraft's proof is for all states already")
         check_outputs({"--json": json}, {"--metric": metric})
     except ValueError as error:
         fail(error)
-    level = BOUNDS[task] if bound is None else bound
     try:
         if metric is not None:
             check_file(metric)
-        if task == "cartpole":
-            found = certify_cartpole(metric, policy, level, episodes, seconds, largest)
-        else:
-            found = certify_spacecraft(metric, policy, level, episodes, seconds)
+        found = room_of(described).part("certify")(described, question)
+    except UnservedError as error:
+        fail(error)
     except (ValueError, OSError, RuntimeError) as error:
         # A metric that cannot be read, or is none, is a certificate that cannot be given.
         fail(error, status=1)
@@ -103,123 +101,6 @@ def certify(
     delivery.tell()
     if not found.holds:
         raise typer.Exit(1)
-
-
-def certify_cartpole(
-    metric_file: Path | None = None,
-    policy: str = "lagros",
-    bound: float = BOUNDS["cartpole"],
-    episodes: int | None = None,
-    seconds: float = 60.0,
-    largest: bool = False,
-) -> Certificate:
-    """Return the cart-pole's certificate.
-
-    Args:
-        metric_file: A metric written by `save_metric`; the shipped one if None.
-        policy: "lagros", with its recorded learning error, or "tube-mpc", which is u*.
-        bound: d_bar, in units of the state per second.
-        episodes: Episodes of each kind of disturbance; 400 if None, 0 for none.
-        seconds: Time for each search for a proof [s].
-        largest: Whether the largest multiple of the region is claimed on which all can be proved.
-
-    Raises:
-        ValueError: The file is no metric.
-        FileNotFoundError: There is no such file.
-    """
-    from lagros_benchmarks.evidence import evidence
-    from lagros_benchmarks.tasks.cartpole.certified_box import largest_proofs, load_cartpole_metric
-    from lagros_envs.tasks.cartpole.task import CartPoleSettings
-    from lagros_policies.tasks.cartpole.certificate import (
-        CartPoleQuestion,
-        cartpole_certificate,
-    )
-
-    task = CartPoleSettings()
-    file, large = evidence.metric_to_prove(metric_file)
-    metric = load_cartpole_metric(file)
-    box, proofs = (
-        largest_proofs(metric, seconds)
-        if largest
-        else evidence.cartpole_proofs(metric, seconds, large)
-    )
-    learned = policy == "lagros"
-    error = evidence.recorded_error("cartpole", policy) if learned else 0.0
-    lines = [evidence.recorded_statement("cartpole", policy, "N")] if learned else []
-    count = _EPISODES["cartpole"] if episodes is None else episodes
-    flights = evidence.fly_cartpole(policy, bound, count) if count else None
-    met: float | None = None
-    if flights is not None:
-        # The network imitates the u* of the task's metric, which may be another.
-        met, line = evidence.met_error(flights, task.system, metric, box)
-        lines.append(line)
-    question = CartPoleQuestion(
-        box=box,
-        disturbance_bound=bound,
-        learning_error=error,
-        paper_radius=task.tube.steady_radius,
-        policy=policy,
-        most_seconds=seconds,
-        control_error=met,
-    )
-    tubes = evidence.cartpole_tubes(task.system, bound)
-    held = evidence.cartpole_held_tubes(task.system, bound)
-    found = cartpole_certificate(task.system, metric, question, proofs, tubes, held)
-    # Nothing is held against a metric that is none.
-    if flights is None or found.tube.certified is None:
-        return found.with_evidence(lines)
-    line, widest = evidence.tube_line(flights, policy, bound)
-    calibrated = evidence.calibrated_cartpole(policy, bound, count) if count >= _LEAST else []
-    return found.with_evidence([*lines, line, *calibrated], widest)
-
-
-def certify_spacecraft(
-    metric_file: Path | None = None,
-    policy: str = "lagros",
-    bound: float = BOUNDS["spacecraft"],
-    worlds: int | None = None,
-    seconds: float = 60.0,
-) -> Certificate:
-    """Return the spacecraft's certificate.
-
-    Args:
-        metric_file: A metric of the axes; that of the policies if None.
-        policy: "lagros", with its recorded learning error, or "centralized", which is u*.
-        bound: d_bar, in units of the state per second.
-        worlds: Worlds to fly; 20 if None, 0 for none.
-        seconds: Not needed: the proofs are exact and take milliseconds.
-
-    Raises:
-        ValueError: The file is no such metric.
-        FileNotFoundError: There is no such file.
-    """
-    from lagros_benchmarks.evidence import evidence
-    from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
-    from lagros_policies.tasks.spacecraft.certificate import spacecraft_certificate
-
-    task = SpacecraftSettings()
-    period = task.control_period
-    plane = evidence.load_axis_metric(metric_file, _PLANE_RATE, period)
-    learned = policy == "lagros"
-    found = spacecraft_certificate(
-        plane,
-        evidence.load_axis_metric(None, _TURNING_RATE, period),
-        task.system,
-        disturbance_bound=bound,
-        learning_error=evidence.recorded_error("spacecraft", policy) if learned else 0.0,
-        paper_radius=task.tube.steady_radius,
-        thrust=task.thrust_scale,
-        policy=policy,
-    )
-    if learned:
-        found = found.with_evidence([evidence.recorded_statement("spacecraft", policy, "m/s^2")])
-    count = _EPISODES["spacecraft"] if worlds is None else worlds
-    if count == 0 or metric_file is not None:
-        return found
-    lines, largest = evidence.fly_spacecraft(found, policy, bound, count)
-    if count >= _LEAST:
-        lines.extend(evidence.calibrated_spacecraft(bound, count))
-    return found.with_evidence(lines, largest)
 
 
 def print_certificate(found: Certificate) -> None:
@@ -247,13 +128,9 @@ def verdict(found: Certificate) -> str:
         return f"NOT every claim holds: {failed} of {len(claims)} do not, and come first."
     kinds = [(sum(line.kind == kind for line in claims), kind) for kind in get_args(Kind)]
     counted = ", ".join(f"{count} {kind}" for count, kind in kinds if count)
-    if found.task == "cartpole":
-        certified, unit = found.tube.certified, ""
-        limits = f"for a control at will, in the region, with {_CHANNELS[found.channels]}"
-        bound = f"Theorem 1 bounds the error {limits}, by"
-    else:
-        certified, unit = found.details["tubes"]["position_held_without_learning_error"], " m"
-        bound = "u*, held for 0.1 s and without learning error, is proved to stay on its plan to"
+    certified, unit = found.reached, f" {found.unit}" if found.unit else ""
+    limits = f"for a control at will, in the region, with {_CHANNELS[found.channels]}"
+    bound = found.reach or f"Theorem 1 bounds the error {limits}, by"
     tube = "no tube is certified" if certified is None else f"{bound} {at_most(certified)}{unit}"
     observed = found.tube.observed
     flown = "nothing was flown"
@@ -275,7 +152,7 @@ def _numbers(found: Certificate) -> Table:
     region = ", ".join(
         f"{name} {low:.4g}..{high:.4g}" for name, (low, high) in found.region.items()
     )
-    if found.task == "spacecraft":
+    if found.everywhere:
         region = f"all states; to draw from: {region}"
     tube, terms = found.tube, len(found.coefficients)
     rows = {
@@ -286,7 +163,9 @@ def _numbers(found: Certificate) -> Table:
         "b̄": at_most(found.b_bar, 6),
         "ε_ℓ": f"{found.epsilon_l:.6g} (observed)",
         "d̄": f"{found.d_bar:g}",
-        "tube, paper": f"{tube.paper:g} (the success threshold; no bound)",
+        "tube, paper": "none is published"
+        if tube.paper is None
+        else f"{tube.paper:g} (the success threshold; no bound)",
         "tube, certified": "none"
         if tube.certified is None
         else f"{at_most(tube.certified)} ({_CHANNELS[found.channels]})",
@@ -295,6 +174,8 @@ def _numbers(found: Certificate) -> Table:
     }
     for name, value in rows.items():
         table.add_row(Text(name), Text(value))
+    for line in found.not_proved:
+        table.add_row(Text("not proved"), Text(line))
     return table
 
 

@@ -17,30 +17,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lagros_policies
-from lagros_benchmarks.tasks.cartpole.worst_case import (
+from lagros_benchmarks.worst_case.flights import (
     Episodes,
+    Flights,
     draw_episodes,
+    expert_of,
     fly,
-    policy_law,
-    profile,
+    law_of,
     random_pushes,
-    tracking_law,
 )
-from lagros_benchmarks.tasks.spacecraft.episodes import fly_chunk
+from lagros_benchmarks.worst_case.goals import profile
 from lagros_benchmarks.worst_case.seeds import CALIBRATION
 from lagros_envs.seeding import episode_seeds
-from lagros_envs.tasks.cartpole import task
-from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+from lagros_envs.task import Task
 from lagros_policies.contraction.conformal import bound_statement, conformal_bound
 from lagros_policies.contraction.statement import Statement
-from lagros_policies.policy import make
-from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 FloatArray = NDArray[np.float64]
 
 # Episodes that fly in one batch.
 _CHUNK = 500
-_WORLDS = 25
 # Hexadecimal digits of a hash in the name of a file.
 _DIGITS = 12
 
@@ -60,21 +56,16 @@ class Score:
     unit: str
 
 
-LEARNING_ERROR = Score("learning_error", "the largest ||u_L - u*|| of an episode", "N")
 TUBE = Score("tube", "the largest ||x - x_d|| of an episode", "(norm of the state)")
 TUBE_SHARE = Score(
     "tube_share", "the largest ||x - x_d|| / r(t), r the published tube, of an episode", ""
 )
-POSITION_ERROR = Score(
-    "position_error", "the largest ||p - p_d|| of any agent of a world (centralised, u*)", "m"
-)
-CARTPOLE_SCORES = (LEARNING_ERROR, TUBE, TUBE_SHARE)
-SPACECRAFT_SCORES = (POSITION_ERROR,)
+POSITION = Score("position_error", "the largest ||p - p_d|| of an episode", "m")
 
 
 @dataclass(frozen=True)
 class EpisodeScores:
-    """Scores of a run of episodes; inf in an episode that fell, had no plan or raised.
+    """Scores of a run of episodes; inf in one that fell, collided, had no plan or raised.
 
     Attributes:
         values: One array (n,) per score, by name.
@@ -94,7 +85,7 @@ def pretrained_hash(task: str, *settings: object, folder: Path | None = None) ->
     flown with the old one is found under the new name.
 
     Args:
-        task: "cartpole" or "spacecraft"; all networks of the task count, whichever of them fly.
+        task: Name of the task; all networks of it count, whichever of them fly.
         settings: What else the flights depend on, each with a `repr` that says all of it.
         folder: Where the files lie; that of the shipped ones if None.
 
@@ -111,190 +102,140 @@ def pretrained_hash(task: str, *settings: object, folder: Path | None = None) ->
     return digest.hexdigest()[:_DIGITS]
 
 
-def cartpole_scores(
+def control_unit(task: Task) -> str:
+    """Return the unit of the controls, "" where they have none or several."""
+    units = {name.partition("[")[2].rstrip("]") for name in task.control_names}
+    return units.pop() if len(units) == 1 else ""
+
+
+def scores_of(task: Task) -> tuple[Score, ...]:
+    """Return what is bounded of the episodes of a task."""
+    error = Score("learning_error", "the largest ||u_L - u*|| of an episode", control_unit(task))
+    share = (TUBE_SHARE,) if task.tube_radius(0.0) is not None else ()
+    return (error, TUBE, *share, *((POSITION,) if task.position else ()))
+
+
+def single_scores(
+    task: Task,
     policy: str = "lagros",
     count: int = 1000,
     namespace: int = CALIBRATION,
     seed: int = 0,
     kind: str = "uniform",
-    bound: float = 0.75,
+    bound: float | None = None,
 ) -> EpisodeScores:
-    """Fly episodes of the cart-pole and return their scores.
+    """Fly episodes of one body and return their scores.
 
     Args:
+        task: The task.
         policy: A policy that keeps no memory, or "tube-mpc".
         count: n, episodes.
         namespace: Of the seeds.
         seed: Seed of the run.
         kind: Kind of the disturbance.
-        bound: d_bar, in units of the state per second.
+        bound: d_bar, in units of the state per second; None for that of the task's commands.
 
     Returns:
-        `CARTPOLE_SCORES` of every episode.
+        `scores_of` every episode.
     """
     begun = perf_counter()
-    expert = CartPoleExpert()
+    expert = expert_of(task)
+    level = task.defaults.bound if bound is None else bound
     seeds = episode_seeds(seed, count, namespace)
     parts = [
-        _cartpole_chunk(policy, seeds[at : at + _CHUNK], kind, bound, expert)
+        _chunk(policy, seeds[at : at + _CHUNK], kind, level, expert)
         for at in range(0, count, _CHUNK)
     ]
     values = {
-        one.name: np.concatenate([part[one.name] for part in parts]) for one in CARTPOLE_SCORES
+        one.name: np.concatenate([part[one.name] for part in parts]) for one in scores_of(task)
     }
     failed = int(np.count_nonzero(np.isinf(values[TUBE.name])))
     return EpisodeScores(values, failed, perf_counter() - begun)
 
 
-def _cartpole_chunk(
-    policy: str, seeds: Sequence[int], kind: str, bound: float, expert: CartPoleExpert
+def _chunk(
+    policy: str, seeds: Sequence[int], kind: str, bound: float, expert: Any
 ) -> dict[str, FloatArray]:
     episodes = draw_episodes(expert, seeds)
-    control = tracking_law(expert, episodes)
-    law = control if policy == "tube-mpc" else policy_law(_built(policy, expert), episodes)
-    every = np.arange(len(episodes.seeds))
+    task, every = episodes.settings, np.arange(len(episodes.seeds))
+    law = law_of(policy, expert, episodes)
     flights = fly(episodes, law, every, random_pushes(episodes, kind, bound))
-    error = np.linalg.norm(flights.states - episodes.plans, axis=-1)
+    error = flights.states - episodes.plans
     found = {
-        LEARNING_ERROR.name: _learning_errors(expert, episodes, flights.states, flights.forces),
-        TUBE.name: error.max(axis=1),
+        "learning_error": learning_errors(expert, episodes, flights),
+        TUBE.name: np.linalg.norm(error, axis=-1).max(axis=1),
         TUBE_SHARE.name: profile(episodes, "tube", every, flights.states).max(axis=1),
+        POSITION.name: np.linalg.norm(error[..., list(task.position)], axis=-1).max(axis=1),
     }
-    # Whoever fell, or had no plan, is infinitely far away.
+    # Whoever fell, collided or had no plan is infinitely far away.
     without = np.full(len(episodes.unplanned), np.inf)
     return {
-        name: np.concatenate([np.where(flights.fallen, np.inf, values), without])
-        for name, values in found.items()
+        one.name: np.concatenate([np.where(flights.lost, np.inf, found[one.name]), without])
+        for one in scores_of(task)
     }
 
 
-def _learning_errors(
-    expert: CartPoleExpert, episodes: Episodes, states: FloatArray, forces: FloatArray
-) -> FloatArray:
-    """Return the largest |u - u*| along each flight, shape (e,) [N]."""
+def learning_errors(expert: Any, episodes: Episodes, flights: Flights) -> FloatArray:
+    """Return the largest ||u - u*|| along each flight, one of each episode, shape (e,)."""
     tracked = expert.track(episodes.plans, episodes.controls)
-    count, steps = forces.shape[:2]
+    count, steps = flights.controls.shape[:2]
     wanted = expert.control(
         tracked,
         np.repeat(np.arange(count), steps),
         np.tile(np.arange(steps), count),
-        states[:, :-1].reshape(-1, task.STATE_DIM),
+        flights.states[:, :-1].reshape(count * steps, -1),
     )
-    return np.asarray(np.abs(forces - wanted.reshape(forces.shape)).max(axis=(1, 2)))
+    off = flights.controls - wanted.reshape(flights.controls.shape)
+    return np.asarray(np.linalg.norm(off, axis=-1).max(axis=1))
 
 
-def spacecraft_scores(
-    count: int = 200,
-    namespace: int = CALIBRATION,
-    seed: int = 0,
-    kind: str = "uniform",
-    bound: float = 0.4,
-    preset: str = "paper",
-    agents: int = 6,
-) -> EpisodeScores:
-    """Fly worlds of the centralised policy and return the largest position error of each.
-
-    Args:
-        count: n, worlds.
-        namespace: Of the seeds.
-        seed: Seed of the run.
-        kind: Kind of the disturbance.
-        bound: d_bar, in units of the state per second.
-        preset: Preset of the scenarios.
-        agents: Agents of each world.
-
-    Returns:
-        `SPACECRAFT_SCORES` of every world.
-    """
-    begun = perf_counter()
-
-    def worlds(number: int) -> SpacecraftVectorEnv:
-        return SpacecraftVectorEnv(
-            number * agents,
-            agents,
-            preset,
-            kind,
-            bound,
-            compiled=False,
-            autoreset_mode="disabled",
-        )
-
-    policy: Any = make("centralized", worlds(1))
-    seeds = episode_seeds(seed, count, namespace)
-    scores = []
-    for at in range(0, count, _WORLDS):
-        for world in fly_chunk(worlds, policy, seeds[at : at + _WORLDS]).worlds:
-            errors = [agent.max_position_error for agent in world.agents]
-            whole = world.error is None and world.planned and None not in errors
-            scores.append(max(e for e in errors if e is not None) if whole else np.inf)
-    values = np.array(scores)
-    failed = int(np.count_nonzero(np.isinf(values)))
-    return EpisodeScores({POSITION_ERROR.name: values}, failed, perf_counter() - begun)
-
-
-def cartpole_statements(
+def single_statements(
+    task: Task,
     level: float = 0.95,
     episodes: int = 1000,
     policy: str = "lagros",
     kind: str = "uniform",
-    bound: float = 0.75,
+    bound: float | None = None,
 ) -> list[Statement]:
-    """Return the calibrated lines of the cart-pole's certificate: learning error and tube.
+    """Return the calibrated lines of a certificate of one body: learning error and tube.
 
     Args:
+        task: The task.
         level: Probability of each bound.
-        episodes: Calibration episodes; about 10 ms each.
-        policy: As for `cartpole_scores`.
+        episodes: Calibration episodes.
+        policy: As for `single_scores`.
         kind: Kind of the disturbance.
-        bound: d_bar, in units of the state per second.
+        bound: d_bar, in units of the state per second; None for that of the task's commands.
 
     Raises:
         ValueError: There are too few episodes for the level.
     """
-    scores = cartpole_scores(policy, episodes, kind=kind, bound=bound)
-    return _statements(CARTPOLE_SCORES, scores, level, f"{policy}, {_where(kind, bound)}")
+    flown = task.defaults.bound if bound is None else bound
+    scores = single_scores(task, policy, episodes, kind=kind, bound=flown)
+    where = f"{policy}, {conditions(kind, flown)}"
+    return calibrated(scores_of(task), scores, level, where)
 
 
-def spacecraft_statements(
-    level: float = 0.95, worlds: int = 100, kind: str = "uniform", bound: float = 0.4
-) -> list[Statement]:
-    """Return the calibrated line of the spacecraft's certificate: the position's tube.
-
-    Args:
-        level: Probability of the bound.
-        worlds: Calibration worlds; about a second each.
-        kind: Kind of the disturbance.
-        bound: d_bar, in units of the state per second.
-
-    Raises:
-        ValueError: There are too few worlds for the level.
-    """
-    scores = spacecraft_scores(worlds, kind=kind, bound=bound)
-    return _statements(SPACECRAFT_SCORES, scores, level, _where(kind, bound))
-
-
-def _statements(
+def calibrated(
     kinds: Sequence[Score], scores: EpisodeScores, level: float, where: str
 ) -> list[Statement]:
+    """Return a calibrated line for each score.
+
+    Args:
+        kinds: The scores.
+        scores: Their values.
+        level: Probability of each bound.
+        where: What was flown, in words.
+
+    Raises:
+        ValueError: There are too few episodes for the level.
+    """
     bounds = [(one, conformal_bound(scores.values[one.name], level)) for one in kinds]
     # All bounds are of the same flights: each line carries its share of their time.
     share = scores.seconds / len(bounds)
     return [bound_statement(one.what, one.unit, bound, where, share) for one, bound in bounds]
 
 
-def _where(kind: str, bound: float) -> str:
+def conditions(kind: str, bound: float) -> str:
+    """Return a disturbance in words."""
     return f"{kind} disturbance, d_bar = {bound:g}"
-
-
-def _built(policy: str, expert: CartPoleExpert) -> Any:
-    import gymnasium as gym
-
-    import lagros_envs  # noqa: F401  (registers the environment)
-
-    env = gym.make(
-        "lagros/CartPole-v0",
-        settings=expert.task,
-        max_episode_steps=expert.task.steps,
-        disable_env_checker=True,
-    )
-    return make(policy, env)

@@ -17,8 +17,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_benchmarks.tasks.spacecraft.claims import position_margin
 from lagros_benchmarks.run.process import undone
+from lagros_benchmarks.tasks.spacecraft.claims import position_margin
 
 FloatArray = NDArray[np.float64]
 Environment = gym.Env[Any, Any]

@@ -10,10 +10,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.run.flying import AnswerError, Attempt, ask
+from lagros_benchmarks.run.library import make_single_policy
 from lagros_envs.disturbances import Disturbance
 from lagros_envs.dynamics import hold_step
 from lagros_envs.numbers import functions
@@ -82,6 +84,11 @@ class Flights:
     def lost(self) -> BoolArray:
         """Whether the flight ended before its time, shape (b,)."""
         return self.fallen | self.collided
+
+
+def parts_of(states: FloatArray) -> list[FloatArray]:
+    """Return the coordinates of states (..., n), as the rules of a task take them."""
+    return list(np.moveaxis(states, -1, 0))
 
 
 def expert_of(task: Task) -> Any:
@@ -194,6 +201,17 @@ def policy_law(policy: Any, episodes: Episodes) -> Law:
     return law
 
 
+def law_of(policy: str, expert: Any, episodes: Episodes) -> Law:
+    """Return a policy as a law, by its name; "tube-mpc" is u* around the plans."""
+    if policy == "tube-mpc":
+        return tracking_law(expert, episodes)
+    task = episodes.settings
+    env = gym.make(
+        task.env_id, settings=task, max_episode_steps=task.steps, disable_env_checker=True
+    )
+    return policy_law(make_single_policy(policy, env), episodes)
+
+
 def observed(
     episodes: Episodes, state: FloatArray, episode: IntArray, step: IntArray
 ) -> NDArray[np.float32]:
@@ -228,9 +246,9 @@ def fly(episodes: Episodes, law: Law, episode: IntArray, pushes: FloatArray) -> 
         pushes: d, shape (b, steps, n), in units of the state per second.
     """
     task, count = episodes.settings, len(episode)
-    state, goal, discs = (part[episode] for part in (
-        episodes.initial_states, episodes.goals, episodes.discs
-    ))
+    state, goal, discs = (
+        part[episode] for part in (episodes.initial_states, episodes.goals, episodes.discs)
+    )
     states = np.empty((count, task.steps + 1, task.system.state_dim))
     controls = np.zeros((count, task.steps, task.system.control_dim))
     alive = np.ones(states.shape[:2], bool)
@@ -242,13 +260,13 @@ def fly(episodes: Episodes, law: Law, episode: IntArray, pushes: FloatArray) -> 
         control = law(state, episode, np.full(count, step))
         following = ahead(task, state, control, pushes[:, step])
         with np.errstate(over="ignore", invalid="ignore"):
-            distance = task.goal_distance(following.T, goal.T, functions)
+            distance = task.goal_distance(parts_of(following), parts_of(goal), functions)
         sane = distance <= LARGEST_DISTANCE
         before, state = state, np.where((up & sane)[:, None], following, state)
         controls[:, step] = np.where(up[:, None], control, 0.0)
         alive[:, step + 1] = up
         gaps[:, step + 1] = disc_gap(task, before, state, discs)
-        fallen |= up & ~(sane & ~task.fallen(state.T, functions))
+        fallen |= up & ~(sane & ~task.fallen(parts_of(state), functions))
         up = up & ~fallen & (gaps[:, step + 1] > 0.0)
         states[:, step + 1] = state
     return Flights(states, controls, alive, fallen, ~up & ~fallen, gaps)
@@ -260,9 +278,7 @@ def ahead(task: Task, state: FloatArray, control: FloatArray, push: FloatArray) 
         return hold_step(task.system, state, control, task.control_period, push)
 
 
-def disc_gap(
-    task: Task, before: FloatArray, after: FloatArray, discs: FloatArray
-) -> FloatArray:
+def disc_gap(task: Task, before: FloatArray, after: FloatArray, discs: FloatArray) -> FloatArray:
     """Return the least distance between the body and a disc on a straight way, shape (b,) [m].
 
     Args:

@@ -6,11 +6,12 @@ import numpy as np
 
 from lagros_benchmarks.worst_case.flights import (
     Episodes,
-    FloatArray,
     Flights,
+    FloatArray,
     IntArray,
     Law,
     ahead,
+    parts_of,
 )
 from lagros_envs.numbers import functions
 from lagros_envs.numbers.dual import gradients, seed
@@ -48,23 +49,24 @@ def profile(
     """
     task = episodes.settings
     radius = task.success_radius(task.control_period * np.arange(states.shape[1]))
-    parts = np.moveaxis(states, -1, 0)
+    parts = parts_of(states)
     if goal == "clearance":
         beyond = np.asarray(task.excess(parts, functions))
         return beyond if gaps is None else np.maximum(beyond, -gaps)
     if goal == "success":
-        goals = np.moveaxis(episodes.goals[episode][:, None], -1, 0)
+        goals = parts_of(episodes.goals[episode][:, None])
         return np.asarray(task.goal_distance(parts, goals, functions) - radius)
     if goal != "tube":
         raise ValueError(f"goal {goal!r} must be one of {', '.join(GOALS)}")
     # Both may be zero at the start.
-    return tracking_error(episodes, episode, states) / np.maximum(radius, radius[1] * 1e-6)
+    error = tracking_error(episodes, episode, states)
+    return np.asarray(error / np.maximum(radius, radius[1] * 1e-6))
 
 
 def tracking_error(episodes: Episodes, episode: IntArray, states: FloatArray) -> FloatArray:
     """Return how far states (b, steps + 1, n) are from x_d, as the task takes distances."""
-    nominal = np.moveaxis(episodes.plans[episode], -1, 0)
-    distance = episodes.settings.goal_distance(np.moveaxis(states, -1, 0), nominal, functions)
+    nominal = parts_of(episodes.plans[episode])
+    distance = episodes.settings.goal_distance(parts_of(states), nominal, functions)
     return np.asarray(distance)
 
 
@@ -79,7 +81,7 @@ def scores(
     """
     values = profile(episodes, goal, episode, flights.states, flights.gaps)
     # The state at the instant of the fall says only how hard the last control was.
-    fallen = episodes.settings.fallen(np.moveaxis(flights.states, -1, 0), functions)
+    fallen = episodes.settings.fallen(parts_of(flights.states), functions)
     whole = ~fallen & (flights.gaps > 0.0)
     counted = flights.alive if goal == "clearance" else flights.alive & whole
     if goal == "success":

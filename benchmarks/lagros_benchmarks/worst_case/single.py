@@ -16,8 +16,8 @@ from lagros_benchmarks.run.library import Policy, make_single_policy
 from lagros_benchmarks.worst_case.certificate import TubeCheck
 from lagros_benchmarks.worst_case.flights import (
     Episodes,
-    FloatArray,
     Flights,
+    FloatArray,
     IntArray,
     Law,
     ahead,
@@ -187,16 +187,14 @@ class SingleBench:
         env: Any = gym.make(self.task.env_id, disable_env_checker=True)
         name, action = f"policy {self.settings.policy!r}", env.action_space.shape
         build = make_single_policy
-        rehearse(
-            name, build(self.settings.policy, env), env.reset(seed=0)[0], [True], action
-        )
-        policy = build(self.settings.policy, env)
+        rehearse(name, build(self.settings.policy, env), env.reset(seed=0)[0], [True], action)
+        policy: Any = build(self.settings.policy, env)
         # One that remembers a plan and nothing else: u* around it stands in for it in a search.
         # What a user derives from ours is another law.
         self.tracks = isinstance(policy, TubeMpcPolicy) and type(policy).__module__.startswith(
             "lagros_policies."
         )
-        self.policy: Any = policy
+        self.policy = policy
         # One whose metric is a network is held against the tube of its own.
         self.expert: Any = self.policy.expert if self.tracks else expert_of(self.task)
         if self.tracks:

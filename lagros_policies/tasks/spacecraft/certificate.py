@@ -117,6 +117,10 @@ def spacecraft_certificate(
             *_tubes(plane, disturbance_bound, learning_error, radius, shown),
             _lemma(pushed, disturbance_bound, learning_error),
         ),
+        verdict_radius=certified_margin(plane, disturbance_bound),
+        reach="u*, held for 0.1 s and without learning error, is proved to stay on its plan to",
+        unit="m",
+        everywhere=True,
         details={
             "tubes": {
                 "position": position.steady_radius,

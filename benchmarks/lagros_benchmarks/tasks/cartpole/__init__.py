@@ -2,4 +2,7 @@
 
 from lagros_benchmarks.run.room import Room
 
-ROOM = Room(attack="lagros_benchmarks.tasks.cartpole.attack:CartPoleBench")
+ROOM = Room(
+    attack="lagros_benchmarks.tasks.cartpole.attack:CartPoleBench",
+    certify="lagros_benchmarks.tasks.cartpole.certify:certify",
+)

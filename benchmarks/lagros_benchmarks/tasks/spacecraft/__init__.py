@@ -2,4 +2,7 @@
 
 from lagros_benchmarks.run.room import Room
 
-ROOM = Room(attack="lagros_benchmarks.tasks.spacecraft.attack:SpacecraftBench")
+ROOM = Room(
+    attack="lagros_benchmarks.tasks.spacecraft.attack:SpacecraftBench",
+    certify="lagros_benchmarks.tasks.spacecraft.certify:certify",
+)

@@ -68,7 +68,11 @@ class SpacecraftBench:
             )
 
     def prepare(self, say: Callable[[str], None]) -> None:
-        """Build the policy, and one target per world; they share it."""
+        """Build everything that flies."""
+        self._targets = self.targets()
+
+    def targets(self) -> list[SpacecraftTarget]:
+        """Return one target per world; they share the policy."""
         settings = self.settings
         # The bound is what policies prepare for.
         env = SpacecraftVectorEnv(
@@ -81,7 +85,7 @@ class SpacecraftBench:
             with building(f"policy {settings.policy!r} with the safety filter"):
                 policy = make_filter(policy, env, settings.bound)
         margin = position_margin(policy, settings.bound)
-        self._targets = [
+        return [
             SpacecraftTarget(
                 policy,
                 seed,
@@ -100,7 +104,7 @@ class SpacecraftBench:
         for number, target in enumerate(self._targets):
             say(f"world {number + 1} of {len(self._targets)}")
             rng = np.random.default_rng([self.settings.seed, number])
-            one = _search_adversary(target, self.settings.search, rng)
+            one = search_adversary(target, self.settings.search, rng)
             if target.goal == "tube":
                 # Beside what the adversary sees, what the error's own loop stands worst.
                 known = _fly_known(target)
@@ -167,7 +171,7 @@ def replay_spacecraft(target: SpacecraftTarget, pushes: FloatArray) -> Outcome:
     return Outcome(target.seed, float(flown.scores[0]), broken, measures)
 
 
-def _search_adversary(
+def search_adversary(
     target: SpacecraftTarget, settings: SearchSettings, rng: np.random.Generator
 ) -> Found:
     """Search the nine numbers of the adversary, and return what its worst flight did."""

@@ -1,0 +1,44 @@
+"""What the training of a network has recorded about it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import lagros_policies
+from lagros_envs.task import Described
+from lagros_policies.contraction.statement import Statement
+
+
+def weights_folder(task: Described) -> Path:
+    """Return where the metric and the networks of a task lie."""
+    own: Path | None = getattr(task, "weights", None)
+    return own or Path(lagros_policies.__file__).parent / "pretrained"
+
+
+def recorded_error(task: Described, policy: str) -> float:
+    """Return the largest ||u_L - u*|| of the held-out samples, from the network's own record.
+
+    Args:
+        task: The task.
+        policy: Name of the network.
+
+    Raises:
+        FileNotFoundError: The network has no record.
+        ValueError: The record holds no such figure.
+    """
+    path = weights_folder(task) / f"{task.name}_{policy}.json"
+    try:
+        return float(json.loads(path.read_text())["learning_error"]["maximum"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} holds no learning_error: {error}") from error
+
+
+def recorded_statement(task: Described, policy: str, unit: str) -> Statement:
+    """Return the recorded learning error as a line of a certificate, in a unit."""
+    error = " ".join(part for part in (f"{recorded_error(task, policy):.4g}", unit) if part)
+    text = (
+        f"||u_L - u*|| <= {error} on the held-out samples of the training of {policy}, "
+        "for the u* that it imitates (its record); no bound for other states"
+    )
+    return Statement(text, "observed", True, 0.0)

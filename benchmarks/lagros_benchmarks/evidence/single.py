@@ -1,0 +1,275 @@
+"""The certificate of one body: what was observed and calibrated, and that nothing is proved.
+
+A task whose metric has a proof brings it by the room it has; here, the condition was only counted
+at states that were drawn, and the certificate says so.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_benchmarks.evidence.calibration import control_unit, single_statements
+from lagros_benchmarks.evidence.records import recorded_error, recorded_statement
+from lagros_benchmarks.worst_case.certificate import sampled_gain
+from lagros_benchmarks.worst_case.flights import (
+    draw_episodes,
+    expert_of,
+    fly,
+    law_of,
+    random_pushes,
+)
+from lagros_benchmarks.worst_case.seeds import CALIBRATION
+from lagros_envs.seeding import episode_seeds
+from lagros_envs.task import Task
+from lagros_policies.contraction import Samples, load_metric
+from lagros_policies.contraction.certificate import Certificate, TubeSizes
+from lagros_policies.contraction.metric import extreme_eigenvalues
+from lagros_policies.contraction.statement import Statement
+from lagros_policies.contraction.theorems import contraction_distance, feasibility_residual
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# Kinds of disturbance of the flights; the calibrated bounds are of the first.
+KINDS = ("uniform", "sphere", "gust")
+LEVEL = 0.95
+# Episodes that a bound of probability 0.95 needs.
+LEAST = 19
+# States at which the feasibility of u* is checked.
+_CHECKS = 10_000
+
+
+class UnservedError(ValueError):
+    """What is asked for does not exist for the task."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a certificate is asked for.
+
+    Attributes:
+        policy: One of the task's `certify_policies`.
+        bound: d_bar, in units of the state per second.
+        episodes: Episodes of each kind of disturbance (worlds); 0 for none.
+        metric: A file of the user's own; None for ours.
+        seconds: Time for each search for a proof [s].
+        largest: Whether the largest multiple of the region is claimed that is proved.
+    """
+
+    policy: str
+    bound: float
+    episodes: int
+    metric: Path | None = None
+    seconds: float = 60.0
+    largest: bool = False
+
+
+@dataclass(frozen=True)
+class SingleFlights:
+    """Episodes of one body, one row each.
+
+    Attributes:
+        states: x at the control instants, shape (e, steps + 1, n).
+        plans: x_d, likewise.
+        nominal: u_d, shape (e, steps, m).
+        controls: u, likewise.
+        fallen: Which of them fell, shape (e,).
+        collided: Which of them met a disc, shape (e,).
+        unplanned: Starts without a plan, which were not flown.
+        period: Control period [s].
+        seconds: Time taken [s].
+    """
+
+    states: FloatArray
+    plans: FloatArray
+    nominal: FloatArray
+    controls: FloatArray
+    fallen: BoolArray
+    collided: BoolArray
+    unplanned: int
+    period: float
+    seconds: float
+
+
+def certify(task: Task, question: Question) -> Certificate:
+    """Return the certificate of a task whose metric nothing was proved of.
+
+    Raises:
+        UnservedError: The task has no metric, or `largest` is asked for.
+        ValueError: The file is none of its states.
+        FileNotFoundError: There is no such file.
+    """
+    if question.largest:
+        raise UnservedError(f"--largest: there is no proof for {task.name} whose region could grow")
+    metric = expert_of(task).metric if question.metric is None else load_metric(question.metric)
+    if metric is None:
+        raise UnservedError(
+            f"{task.name} has no metric, and a certificate is about one: give the task a "
+            "MetricDesign, or --metric a file"
+        )
+    learned = question.policy != "tube-mpc"
+    lines = [_condition(metric), _feasible(task, metric)]
+    error = recorded_error(task, question.policy) if learned else 0.0
+    if learned:
+        lines.append(recorded_statement(task, question.policy, control_unit(task)))
+    observed = None
+    if question.episodes:
+        flights = fly_kinds(task, question.policy, question.bound, question.episodes)
+        lines.append(met_error(task, flights, metric)[1])
+        line, observed = tube_line(flights, question.policy, question.bound)
+        lines += [line, *calibrated_lines(task, question)]
+    # Those of W_bar are the inverses of those of M.
+    most, least = (1.0 / value for value in extreme_eigenvalues(metric))
+    radius = task.tube_radius(task.time_limit)
+    return Certificate(
+        task=task.name,
+        policy=question.policy,
+        region=region_of(task),
+        alpha=metric.contraction_rate,
+        chi=most / least,
+        nu=metric.control_weight / least,
+        b_bar=sampled_gain(expert_of(task)),
+        epsilon_l=error,
+        d_bar=question.bound,
+        channels="all",
+        basis=str(getattr(metric, "basis", "")),
+        coefficients=metric.coefficients / least,
+        tube=TubeSizes(None if radius is None else float(radius), None, observed),
+        statements=tuple(lines),
+        not_proved=(
+            f"no proof for {task.name}: the condition was counted at states that were drawn, and "
+            "no tube is certified",
+        ),
+    )
+
+
+def region_of(task: Task) -> dict[str, tuple[float, float]]:
+    """Return the bounds of x_d in the design of the metric, by the names of the coordinates."""
+    design = task.metric
+    if design is None:
+        return {}
+    names = task.state_names or tuple(f"x{index}" for index in range(task.system.state_dim))
+    ends = zip(design.low, design.high, strict=True)
+    return dict(zip((name.partition(" ")[0] for name in names), ends, strict=True))
+
+
+def _condition(metric: Any) -> Statement:
+    check = metric.verification
+    if check is None:
+        text = "equation (14) was checked nowhere: the metric's file says nothing of it"
+        return Statement(text, "observed", False, 0.0)
+    text = (
+        f"equation (14), alpha = {metric.contraction_rate:g} 1/s, continuous control, at "
+        f"{check.samples - check.violations} of {check.samples} states drawn from the region "
+        f"(worst {check.worst:.3g} 1/s; negative holds)"
+    )
+    return Statement(text, "observed", check.violations == 0, 0.0)
+
+
+def _feasible(task: Task, metric: Any) -> Statement:
+    begun = time.monotonic()
+    samples = metric.region.sample(np.random.default_rng(0), _CHECKS)
+    worst = float(feasibility_residual(task.system, metric, samples).max())
+    text = (
+        f"Theorem 2: the program for u* is feasible, by u_d - nu B'W_bar^-1 e, at all "
+        f"{_CHECKS} states drawn from the region (worst {worst:.3g} 1/s; negative is feasible)"
+    )
+    return Statement(text, "observed", worst <= 0.0, time.monotonic() - begun)
+
+
+def fly_kinds(task: Task, policy: str, bound: float, count: int) -> SingleFlights:
+    """Fly episodes of one body under several kinds of disturbance.
+
+    Args:
+        task: The task.
+        policy: A policy that keeps no memory, or "tube-mpc".
+        bound: d_bar, in units of the state per second.
+        count: Episodes of each kind.
+    """
+    begun = time.monotonic()
+    expert = expert_of(task)
+    episodes = draw_episodes(expert, episode_seeds(1, count, CALIBRATION))
+    every = np.arange(len(episodes.seeds))
+    law = law_of(policy, expert, episodes)
+    flown = [fly(episodes, law, every, random_pushes(episodes, kind, bound)) for kind in KINDS]
+    return SingleFlights(
+        states=np.concatenate([flight.states for flight in flown]),
+        plans=np.tile(episodes.plans, (len(flown), 1, 1)),
+        nominal=np.tile(episodes.controls, (len(flown), 1, 1)),
+        controls=np.concatenate([flight.controls for flight in flown]),
+        fallen=np.concatenate([flight.fallen for flight in flown]),
+        collided=np.concatenate([flight.collided for flight in flown]),
+        unplanned=len(episodes.unplanned),
+        period=task.control_period,
+        seconds=time.monotonic() - begun,
+    )
+
+
+def met_error(
+    task: Task, flights: SingleFlights, metric: Any, inside: BoolArray | None = None
+) -> tuple[float, Statement]:
+    """Return how far the controls of flights were from contracting ones, in the region.
+
+    Args:
+        task: The task.
+        flights: The flights.
+        metric: The metric in which a control is to contract.
+        inside: Which instants count, shape (e, steps); those in the metric's region if None.
+
+    Returns:
+        The largest distance, in the units of the control, and the line of the certificate.
+    """
+    begun = time.monotonic()
+    state, nominal = flights.states[:, :-1], flights.plans[:, :-1]
+    if inside is None:
+        inside = np.asarray(metric.region.contains(state, nominal, flights.nominal))
+    counted = inside & ~(flights.fallen | flights.collided)[:, None]
+    # At e = 0 nothing is asked of the control.
+    counted &= np.abs(state - nominal).max(axis=-1) > 0.0
+    samples = Samples(state[counted], nominal[counted], flights.nominal[counted])
+    distance = contraction_distance(task.system, metric, samples, flights.controls[counted])
+    largest = float(distance.max(initial=0.0))
+    within = " ".join(part for part in (f"{largest:.4g}", control_unit(task)) if part)
+    text = (
+        f"at the {len(distance)} instants of {len(state)} episodes that lay in the region, the "
+        f"control was within {within} of one that contracts in this metric"
+    )
+    holds = bool(np.isfinite(largest)) and len(distance) > 0
+    return largest, Statement(text, "observed", holds, time.monotonic() - begun)
+
+
+def tube_line(flights: SingleFlights, policy: str, bound: float) -> tuple[Statement, float]:
+    """Return what flights were observed to do around x_d, and the largest ||x - x_d||.
+
+    Nothing certified is counted against them: their control is held and all states are disturbed.
+    """
+    begun = time.monotonic()
+    whole = ~(flights.fallen | flights.collided)
+    error = np.linalg.norm(flights.states - flights.plans, axis=-1)[whole]
+    largest = float(error.max(initial=0.0))
+    collided = int(np.count_nonzero(flights.collided))
+    text = (
+        f"{policy}, held {flights.period:g} s, d_bar = {bound:g} ({', '.join(KINDS)}): the "
+        f"largest ||x - x_d|| of {len(whole)} episodes is {largest:.4g}; "
+        f"{int(np.count_nonzero(flights.fallen))} fell, "
+        + (f"{collided} collided, " if collided else "")
+        + f"{flights.unplanned} starts had no plan"
+    )
+    seconds = flights.seconds + time.monotonic() - begun
+    return Statement(text, "observed", True, seconds), largest
+
+
+def calibrated_lines(task: Task, question: Question) -> Sequence[Statement]:
+    """Return the calibrated bounds, where there are enough episodes for them."""
+    if question.episodes < LEAST:
+        return []
+    return single_statements(
+        task, LEVEL, question.episodes, question.policy, KINDS[0], question.bound
+    )

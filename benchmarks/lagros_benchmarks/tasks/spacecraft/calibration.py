@@ -1,0 +1,89 @@
+"""Scores of the spacecraft's worlds for calibrated bounds: the position's tube."""
+
+from __future__ import annotations
+
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lagros_benchmarks.evidence.calibration import EpisodeScores, Score, calibrated, conditions
+from lagros_benchmarks.tasks.spacecraft.episodes import fly_chunk
+from lagros_benchmarks.worst_case.seeds import CALIBRATION
+from lagros_envs.seeding import episode_seeds
+from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+from lagros_policies.contraction.statement import Statement
+from lagros_policies.policy import make
+
+POSITION_ERROR = Score(
+    "position_error", "the largest ||p - p_d|| of any agent of a world (centralised, u*)", "m"
+)
+# Worlds that fly in one batch.
+_WORLDS = 25
+
+
+def spacecraft_scores(
+    count: int = 200,
+    namespace: int = CALIBRATION,
+    seed: int = 0,
+    kind: str = "uniform",
+    bound: float = 0.4,
+    preset: str = "paper",
+    agents: int = 6,
+) -> EpisodeScores:
+    """Fly worlds of the centralised policy and return the largest position error of each.
+
+    Args:
+        count: n, worlds.
+        namespace: Of the seeds.
+        seed: Seed of the run.
+        kind: Kind of the disturbance.
+        bound: d_bar, in units of the state per second.
+        preset: Preset of the scenarios.
+        agents: Agents of each world.
+
+    Returns:
+        `POSITION_ERROR` of every world.
+    """
+    begun = perf_counter()
+
+    def worlds(number: int) -> SpacecraftVectorEnv:
+        return SpacecraftVectorEnv(
+            number * agents,
+            agents,
+            preset,
+            kind,
+            bound,
+            compiled=False,
+            autoreset_mode="disabled",
+        )
+
+    policy: Any = make("centralized", worlds(1))
+    seeds = episode_seeds(seed, count, namespace)
+    scores = []
+    for at in range(0, count, _WORLDS):
+        for world in fly_chunk(worlds, policy, seeds[at : at + _WORLDS]).worlds:
+            errors = [agent.max_position_error for agent in world.agents]
+            whole = world.error is None and world.planned and None not in errors
+            scores.append(max(e for e in errors if e is not None) if whole else np.inf)
+    values = np.array(scores)
+    failed = int(np.count_nonzero(np.isinf(values)))
+    return EpisodeScores({POSITION_ERROR.name: values}, failed, perf_counter() - begun)
+
+
+def spacecraft_statements(
+    level: float = 0.95, worlds: int = 100, kind: str = "uniform", bound: float = 0.4
+) -> list[Statement]:
+    """Return the calibrated line of the spacecraft's certificate: the position's tube.
+
+    Args:
+        level: Probability of the bound.
+        worlds: Calibration worlds; about a second each.
+        kind: Kind of the disturbance.
+        bound: d_bar, in units of the state per second.
+
+    Raises:
+        ValueError: There are too few worlds for the level.
+    """
+    scores = spacecraft_scores(worlds, kind=kind, bound=bound)
+    return calibrated((POSITION_ERROR,), scores, level, conditions(kind, bound))
