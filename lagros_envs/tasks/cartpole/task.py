@@ -135,10 +135,6 @@ class CartPoleSettings(Task):
         """Return the radius of the published tube at a time [s]."""
         return self.tube.radius(time)
 
-    def tube_radius(self, time: Any) -> Any:
-        """Return the same radius, which the paper publishes for x_d, too."""
-        return self.tube.radius(time)
-
     def excess(self, state: Sequence[Any], functions: Any) -> Any:
         """Return by how much the pole leans beyond the angle at which it has fallen [rad]."""
         return abs(state[1]) - FALL_ANGLE
