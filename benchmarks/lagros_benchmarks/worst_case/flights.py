@@ -21,7 +21,7 @@ from lagros_envs.dynamics import hold_step
 from lagros_envs.numbers import functions
 from lagros_envs.seeding import episode_streams
 from lagros_envs.sweep import closest_approach
-from lagros_envs.task import LARGEST_CONTROL, LARGEST_DISTANCE, Task
+from lagros_envs.task import LARGEST_DISTANCE, Task, distance_between
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -117,10 +117,6 @@ def draw_episodes(expert: Any, seeds: Sequence[int]) -> Episodes:
     solved = [entry for entry in planned if entry[2].solved]
     if not solved:
         raise RuntimeError(f"none of the {len(seeds)} episodes has a plan")
-    most = max(len(one.discs) for _, one, _ in solved)
-    discs = np.zeros((len(solved), most, 3))
-    for row, (_, one, _) in zip(discs, solved, strict=True):
-        row[: len(one.discs)] = one.discs
     return Episodes(
         settings,
         tuple(seed for seed, _, _ in solved),
@@ -128,7 +124,7 @@ def draw_episodes(expert: Any, seeds: Sequence[int]) -> Episodes:
         np.stack([one.goal for _, one, _ in solved]),
         np.stack([plan.states for _, _, plan in solved]),
         np.stack([plan.controls for _, _, plan in solved]),
-        discs,
+        np.stack([settings.all_discs(one.discs) for _, one, _ in solved]),
         tuple(seed for seed, _, plan in planned if not plan.solved),
     )
 
@@ -150,12 +146,11 @@ def tracking_law(expert: Any, episodes: Episodes) -> Law:
     """Return u* around the plans: policy (b), whose re-plans confirm the plan it has."""
     tracked = expert.track(episodes.plans, episodes.controls)
     task = episodes.settings
-    centre, scale = np.array(task.control_centre), np.array(task.control_scale)
 
     def law(state: FloatArray, episode: IntArray, step: IntArray) -> FloatArray:
         control = expert.control(tracked, episode, step, state)
         # The environment takes the action in single precision, of the state that it shows.
-        return applied(task, (control - centre) / scale)
+        return applied(task, task.action(control))
 
     return law
 
@@ -217,23 +212,18 @@ def observed(
 ) -> NDArray[np.float32]:
     """Return what the environment shows of states (b, n) at control steps (b,)."""
     task = episodes.settings
-    count, n = state.shape
-    rows = np.zeros((count, 3 * n + 1 + 3 * task.most_discs), np.float32)
-    rows[:, :n] = state
-    rows[:, n : 2 * n] = episodes.goals[episode]
-    rows[:, 2 * n : 3 * n] = episodes.initial_states[episode]
-    rows[:, 3 * n] = step * task.control_period
-    discs = episodes.discs[episode].reshape(count, -1)
-    rows[:, 3 * n + 1 : 3 * n + 1 + discs.shape[1]] = discs
+    rows = np.zeros((len(state), task.layout.size), np.float32)
+    rows[:, task.layout.state] = state
+    rows[:, task.layout.goal] = episodes.goals[episode]
+    rows[:, task.layout.initial_state] = episodes.initial_states[episode]
+    rows[:, task.layout.time] = step * task.control_period
+    rows[:, task.layout.discs] = episodes.discs[episode].reshape(len(state), -1)
     return rows
 
 
 def applied(task: Task, action: NDArray[Any]) -> FloatArray:
     """Return the control (b, m) that an action (b, m) makes, in single precision as it is given."""
-    single = np.asarray(action, np.float32).astype(np.float64)
-    control = np.array(task.control_centre) + np.array(task.control_scale) * single
-    low = np.maximum(task.control_low, -LARGEST_CONTROL)
-    return np.clip(control, low, np.minimum(task.control_high, LARGEST_CONTROL))
+    return task.control(np.asarray(action, np.float32).astype(np.float64))
 
 
 def fly(episodes: Episodes, law: Law, episode: IntArray, pushes: FloatArray) -> Flights:
@@ -255,19 +245,19 @@ def fly(episodes: Episodes, law: Law, episode: IntArray, pushes: FloatArray) -> 
     gaps = np.full(states.shape[:2], np.inf)
     states[:, 0] = state
     gaps[:, 0] = disc_gap(task, state, state, discs)
-    up, fallen = np.ones(count, bool), np.zeros(count, bool)
+    up, fallen = gaps[:, 0] >= 0.0, np.zeros(count, bool)
     for step in range(task.steps):
         control = law(state, episode, np.full(count, step))
         following = ahead(task, state, control, pushes[:, step])
         with np.errstate(over="ignore", invalid="ignore"):
-            distance = task.goal_distance(parts_of(following), parts_of(goal), functions)
+            distance = distance_between(parts_of(following), parts_of(goal), functions)
         sane = distance <= LARGEST_DISTANCE
         before, state = state, np.where((up & sane)[:, None], following, state)
         controls[:, step] = np.where(up[:, None], control, 0.0)
         alive[:, step + 1] = up
         gaps[:, step + 1] = disc_gap(task, before, state, discs)
         fallen |= up & ~(sane & ~task.fallen(parts_of(state), functions))
-        up = up & ~fallen & (gaps[:, step + 1] > 0.0)
+        up = up & ~fallen & (gaps[:, step + 1] >= 0.0)
         states[:, step + 1] = state
     return Flights(states, controls, alive, fallen, ~up & ~fallen, gaps)
 
@@ -285,12 +275,12 @@ def disc_gap(task: Task, before: FloatArray, after: FloatArray, discs: FloatArra
         task: The task.
         before: States at the start of the way, shape (b, n).
         after: States at its end.
-        discs: Shape (b, k, 3).
+        discs: Shape (b, k, 3); one of radius zero is none.
 
     Returns:
         Negative inside a disc; inf where there is none.
     """
-    if not task.position or discs.shape[1] == 0:
+    if not discs.shape[1]:
         return np.full(len(after), np.inf)
     place = list(task.position)
     ends = np.stack([before[:, place], after[:, place]])[:, :, None] - discs[:, :, :2]

@@ -82,7 +82,7 @@ def scores(
     values = profile(episodes, goal, episode, flights.states, flights.gaps)
     # The state at the instant of the fall says only how hard the last control was.
     fallen = episodes.settings.fallen(parts_of(flights.states), functions)
-    whole = ~fallen & (flights.gaps > 0.0)
+    whole = ~fallen & (flights.gaps >= 0.0)
     counted = flights.alive if goal == "clearance" else flights.alive & whole
     if goal == "success":
         values = np.where(counted, values, np.inf)

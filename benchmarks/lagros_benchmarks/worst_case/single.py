@@ -10,8 +10,9 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 
+from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.episodes import TUBE_TOLERANCE
-from lagros_benchmarks.run.flying import Attempt, ask, rehearse, reseed
+from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.library import Policy, make_single_policy
 from lagros_benchmarks.worst_case.certificate import TubeCheck
 from lagros_benchmarks.worst_case.flights import (
@@ -185,10 +186,10 @@ class SingleBench:
         """Build everything, and plan the episodes."""
         say("planning")
         env: Any = gym.make(self.task.env_id, disable_env_checker=True)
-        name, action = f"policy {self.settings.policy!r}", env.action_space.shape
-        build = make_single_policy
-        rehearse(name, build(self.settings.policy, env), env.reset(seed=0)[0], [True], action)
-        policy: Any = build(self.settings.policy, env)
+        name = self.settings.policy
+        ClosedLoop(env, make_single_policy(name, env)).rehearse(f"policy {name!r}")
+        # Another one flies: a policy may count its calls without being told.
+        policy: Any = make_single_policy(name, env)
         # One that remembers a plan and nothing else: u* around it stands in for it in a search.
         # What a user derives from ours is another law.
         self.tracks = isinstance(policy, TubeMpcPolicy) and type(policy).__module__.startswith(
@@ -286,6 +287,7 @@ def replay_single(
     score = float(scores(episodes, goal, where, flight)[0][0])
     errors = tracking_error(episodes, where, flight.states)[0][flight.alive[0]]
     radius = task.success_radius(task.control_period * np.arange(len(errors)))
+    away = (flight.states - episodes.plans[index])[0][flight.alive[0]]
     lost = bool(flight.lost[0])
     left = lost or bool(np.any(errors > radius + TUBE_TOLERANCE))
     broken = {"tube": left, "success": not info["success"], "clearance": lost}[goal]
@@ -295,7 +297,7 @@ def replay_single(
         "fallen": bool(flight.fallen[0]),
         **({"collided": bool(flight.collided[0])} if "collided" in info else {}),
         "left_paper_tube": left,
-        "max_tracking_error": float(errors.max()),
+        "max_tracking_error": float(np.linalg.norm(away, axis=-1).max()),
     }
     return Outcome(seed, score, bool(broken), measures), flight
 
@@ -304,27 +306,19 @@ def _flight(
     env: Any, policy: Policy, seed: int, nominal: FloatArray
 ) -> tuple[Flights, dict[str, Any]]:
     task: Task = env.settings
-    observation, info = env.reset(seed=seed, options={"nominal": nominal})
-    discs = env.scenario.discs[None] if task.position else np.zeros((1, 0, 3))
+    loop = ClosedLoop(env, policy)
     states = np.empty((1, task.steps + 1, task.system.state_dim))
-    states[0, :] = env.state
     controls = np.zeros((1, task.steps, task.system.control_dim))
-    centre, scale = np.array(task.control_centre), np.array(task.control_scale)
     alive = np.zeros(states.shape[:2], bool)
     gaps = np.full(states.shape[:2], np.inf)
-    alive[0, 0], gaps[:, 0] = True, disc_gap(task, states[:, 0], states[:, 0], discs)
-    reseed(policy, seed)
-    memory: Any = None
-    over = False
-    for step in range(task.steps):
-        action, memory, _ = ask(policy, observation, memory, [step == 0], env.action_space.shape)
-        controls[0, step] = centre + scale * action.astype(np.float64)
-        observation, _, over, _, info = env.step(action)
-        states[0, step + 1 :] = env.state
-        alive[0, step + 1] = True
-        gaps[:, step + 1] = disc_gap(task, states[:, step], states[:, step + 1], discs)
-        if over:
-            break
-    collided = bool(info.get("collided", False))
-    ended = np.array([over and not collided]), np.array([collided])
-    return Flights(states, controls, alive, *ended, gaps), info
+    for _ in loop.fly(seed, {"nominal": nominal}):
+        step = loop.step
+        states[0, step:], alive[0, step] = env.state, True
+        discs = task.all_discs(env.scenario.discs)[None]
+        gaps[:, step] = disc_gap(task, states[:, max(step - 1, 0)], states[:, step], discs)
+        if step:
+            controls[0, step - 1] = task.control(loop.action.astype(np.float64))
+    fallen, collided = (
+        np.array([bool(loop.info.get(name, False))]) for name in ("fallen", "collided")
+    )
+    return Flights(states, controls, alive, fallen, collided, gaps), loop.info
