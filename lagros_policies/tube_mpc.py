@@ -162,7 +162,7 @@ class TubeMpcPolicy(BasePolicy):
         if memory.tracked is None:
             return np.zeros(1)
         state = row[None, task.STATE]
-        force = self.expert.control(memory.tracked, np.zeros(1, int), np.full(1, step), state)
+        force = self.expert.wanted(memory.tracked, np.zeros(1, int), np.full(1, step), state)
         return force.reshape(1)
 
     def _applied(self, force: FloatArray, memory: TubeMpcState) -> FloatArray:

@@ -37,7 +37,6 @@ from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.actor import PpoPolicy
 from lagros_policies.baselines import LqrPolicy
-from lagros_policies.contraction.feedback import preferred_deviation
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.remarks.adaptive import (
     AdaptiveControl,
@@ -102,14 +101,12 @@ def tracking_law(
 
     def law(state: FloatArray, step: int) -> FloatArray:
         nominal, control = episodes.states[:, step], episodes.controls[:, step]
-        preferred = preferred_deviation(
-            expert.feedback,
+        preferred = expert.preference.deviation(
             plans.gains,
             everyone,
             np.full(count, step),
             state - nominal,
             np.full(count, step * period),
-            period,
         )
         force, memory[1] = adaptive.control(state, nominal, control, memory[0], preferred)
         return force

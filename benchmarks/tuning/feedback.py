@@ -1,4 +1,4 @@
-"""Find the weights of the feedback that u* prefers (lagros_policies/contraction/feedback.py).
+"""Find the weights of the feedback that u* prefers (lagros_policies/tasks/cartpole/feedback.py).
 
 Minimises, by gradient descent through simulated episodes, the share of episodes whose error leaves
 the published tube under the uniform disturbance of bound 0.75. An episode is a plan of a random
@@ -41,8 +41,9 @@ from lagros_envs.dynamics import hold_step, linearise_hold
 from lagros_envs.dynamics.integrate import rk4_hold
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.tasks.cartpole import task
-from lagros_policies.contraction.feedback import _TERMINAL_WEIGHT, FeedbackSettings, WeightSchedule
+from lagros_policies.contraction.feedback import _TERMINAL_WEIGHT
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.feedback import FeedbackSettings, WeightSchedule
 
 FloatArray = NDArray[np.float64]
 Weights = dict[str, torch.Tensor]

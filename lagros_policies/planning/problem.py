@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -186,6 +188,30 @@ class Problem:
             control_high=largest,
             discs=around,
         )
+
+    def rest(self, steps: int, initial_state: FloatArray, terminal_state: FloatArray) -> Problem:
+        """Return the problem of its last steps, from and to other states.
+
+        Nothing is looked at again: the states must be n finite numbers each that keep bounds and
+        discs. A planner that renews its plan at every step asks for a tenth of the time so.
+
+        Args:
+            steps: How many of the steps are left.
+            initial_state: Where the plan begins, shape (n,).
+            terminal_state: Where it ends, shape (n,).
+        """
+        left = copy(self)
+        changed: dict[str, Any] = {
+            "steps": steps,
+            "initial_state": np.asarray(initial_state, np.float64),
+            "terminal_state": np.asarray(terminal_state, np.float64),
+        }
+        for name in ("state_low", "state_high", "control_low", "control_high"):
+            changed[name] = getattr(self, name)[-steps:]
+        if self.discs is not None and self.discs.margin.ndim:
+            changed["discs"] = replace(self.discs, margin=self.discs.margin[-(steps + 1) :])
+        left.__dict__.update(changed)
+        return left
 
     def _take(self, name: str, shape: tuple[int, ...], broadcast: bool = True) -> None:
         given = getattr(self, name)

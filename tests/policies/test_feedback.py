@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from lagros_policies.contraction.feedback import (
+from lagros_policies.contraction.feedback import riccati_gains
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.feedback import (
     FeedbackSettings,
     WeightSchedule,
     gain_table,
     preferred_deviation,
-    riccati_gains,
 )
-from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 STEPS, N = 12, 3
 

@@ -1,1 +1,4 @@
 """What is special to the cart-pole."""
+
+PLANNER = "lagros_policies.tasks.cartpole.planner:CartPolePlanner"
+PREFERENCE = "lagros_policies.tasks.cartpole.feedback:GatedRegulator"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,8 +9,9 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import check_fields, check_positive
 from lagros_envs.tasks.cartpole.physics import ANGLE
-from lagros_envs.tasks.cartpole.task import FALL_ANGLE, CartPoleSettings
+from lagros_envs.tasks.cartpole.task import FALL_ANGLE, STATE_DIM, CartPoleSettings
 from lagros_policies.contraction.tube import tighten
+from lagros_policies.planning.planner import check_states, steps_left
 from lagros_policies.planning.problem import Problem
 from lagros_policies.planning.scp import ScpSettings, solve_scp
 from lagros_policies.planning.trajectory import Trajectory
@@ -68,8 +68,21 @@ class CartPolePlanner:
         """Remember task and settings."""
         self.task = task or CartPoleSettings()
         self.settings = settings or CartPolePlannerSettings()
+        high = np.full((self.task.steps, STATE_DIM), np.inf)
+        # At the end the state is given, not bounded.
+        times = self.task.control_period * np.arange(1.0, self.task.steps)
+        high[:-1, ANGLE] = self.angle_limit(times)
+        rest = np.zeros(STATE_DIM)
+        free = Problem(
+            self.task.system, self.task.control_period, self.task.steps, rest, rest, -high, high
+        )
         limit = self.task.force_limit
-        self._largest = math.inf if limit is None else limit
+        self._free = free
+        self._limited = (
+            None
+            if limit is None
+            else replace(free, control_low=np.array(-limit), control_high=np.array(limit))
+        )
 
     def angle_limit(self, time: FloatArray) -> FloatArray:
         """Return the tightened bound of |theta_d| [rad] at the times [s] (Theorem 3)."""
@@ -83,62 +96,23 @@ class CartPolePlanner:
         goal: FloatArray,
         start_step: int = 0,
         guess: Trajectory | None = None,
+        discs: FloatArray | None = None,
     ) -> Trajectory:
-        """Plan from a state at a control instant to the goal at the time limit.
-
-        Args:
-            initial_state: x at the instant, shape (4,).
-            goal: x_f, shape (4,).
-            start_step: Index k of the instant; the plan covers the steps that remain.
-            guess: A plan whose last part is the warm start.
-
-        Returns:
-            The plan, over task.steps - start_step steps.
-
-        Raises:
-            ValueError: No step remains, the guess is shorter than what remains, or a state is
-                misshapen or not finite.
-        """
-        for name, vector in (("initial_state", initial_state), ("goal", goal)):
-            if np.shape(vector) != (4,) or not np.all(np.isfinite(vector)):
-                raise ValueError(f"{name}={vector!r} must be 4 finite numbers")
-        horizon = self.task.steps - start_step
-        if not 1 <= horizon <= self.task.steps:
-            raise ValueError(
-                f"start_step={start_step} is not one of the {self.task.steps} steps before the "
-                "time limit"
-            )
-        if guess is not None and guess.horizon < horizon:
-            raise ValueError(
-                f"guess covers {guess.horizon} steps, but {horizon} remain from "
-                f"start_step={start_step}"
-            )
-        times = self.task.control_period * np.arange(start_step + 1.0, self.task.steps)
-        # At the end the state is given, not bounded.
-        high = np.full((horizon, 4), np.inf)
-        high[:-1, ANGLE] = self.angle_limit(times)
+        """Plan to the goal at the time limit; see `planning.planner.Planner.plan`."""
+        check_states(STATE_DIM, initial_state=initial_state, goal=goal)
+        left = steps_left(self.task, start_step, guess)
         scp = self.settings.scp
-        problem = Problem(
-            self.task.system,
-            self.task.control_period,
-            horizon,
-            np.asarray(initial_state, np.float64),
-            np.asarray(goal, np.float64),
-            -high,
-            high,
-        )
-        warm, largest = None, self._largest
-        if guess is not None:
-            warm = guess.states[-(horizon + 1) :], guess.controls[-horizon:]
-        if guess is None or not self._keeps(guess) or math.isinf(largest):
+        warm = None if guess is None else (guess.states[-(left + 1) :], guess.controls[-left:])
+        if guess is None or not self._keeps(guess) or self._limited is None:
             # From a straight line the linearised dynamics may ask for more than the limit.
-            plan = solve_scp(problem, warm, scp)
+            plan = solve_scp(self._free.rest(left, initial_state, goal), warm, scp)
             if not plan.solved or self._keeps(plan):
                 return plan
             warm = plan.states, plan.controls
-        low, high = np.array(-largest), np.array(largest)
-        return solve_scp(replace(problem, control_low=low, control_high=high), warm, scp)
+        assert self._limited is not None  # a plan without a limit keeps it
+        return solve_scp(self._limited.rest(left, initial_state, goal), warm, scp)
 
     def _keeps(self, plan: Trajectory) -> bool:
         """Return whether a plan keeps the force limit."""
-        return bool(np.max(np.abs(plan.controls)) <= self._largest + FORCE_SLACK)
+        limit = self.task.force_limit
+        return limit is None or bool(np.max(np.abs(plan.controls)) <= limit + FORCE_SLACK)
