@@ -8,7 +8,6 @@ the weights: the same network serves any number of agents and obstacles.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,10 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import shown
-from lagros_policies.learning.networks import read_safetensors, write_safetensors
+from lagros_policies.learning.networks import (
+    Layers,
+    checked_layers,
+    layers_of,
+    read_safetensors,
+    tensors_of,
+    write_safetensors,
+)
 
 Float32Array = NDArray[np.float32]
-Layers = Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
 
 _FORMAT = "lagros-deep-set-1"
 # Up to this many entries a matrix of weights adds up faster than a walk over the owners.
@@ -89,11 +94,10 @@ class DeepSet:
         self.metadata = dict(metadata or {})
         parts = {"neighbour": neighbour, "obstacle": obstacle, "agent": agent}
         self.layers = {
-            name: [(_float32(weight), _float32(bias)) for weight, bias in layers]
-            for name, layers in parts.items()
+            name: checked_layers(layers, f" of {name}") for name, layers in parts.items()
         }
         (near, first), (still, second), (whole, self.outputs) = (
-            _check(name, layers) for name, layers in self.layers.items()
+            (len(layers[0][0]), len(layers[-1][1])) for layers in self.layers.values()
         )
         own = whole - first - second
         if own < 1:
@@ -139,13 +143,7 @@ class DeepSet:
 
     def save(self, path: Path | str) -> None:
         """Write weights and metadata as safetensors, atomically."""
-        tensors = {
-            f"{part}{index}.{name}": tensor
-            for part, layers in self.layers.items()
-            for index, layer in enumerate(layers)
-            for name, tensor in zip(("weight", "bias"), layer, strict=True)
-        }
-        write_safetensors(path, tensors, {**self.metadata, "format": _FORMAT})
+        write_safetensors(path, tensors_of(self.layers), {**self.metadata, "format": _FORMAT})
 
     @classmethod
     def load(cls, path: Path | str) -> DeepSet:
@@ -160,18 +158,9 @@ class DeepSet:
             raise ValueError(
                 f"{path} is not a deep set of this package: its metadata say {shown(metadata)}"
             )
-        counts = [sum(name.startswith(part) for name in tensors) // 2 for part in _PARTS]
-        names = [
-            [(f"{part}{index}.weight", f"{part}{index}.bias") for index in range(count)]
-            for part, count in zip(_PARTS, counts, strict=True)
-        ]
-        if sorted(tensors) != sorted(name for part in names for layer in part for name in layer):
-            raise ValueError(
-                f"{path} holds the tensors {shown(sorted(tensors))}, which are no layers"
-            )
-        layers = [[(tensors[weight], tensors[bias]) for weight, bias in part] for part in names]
+        neighbour, obstacle, agent = layers_of(path, tensors, _PARTS)
         try:
-            return cls(layers[0], layers[1], layers[2], metadata)
+            return cls(neighbour, obstacle, agent, metadata)
         except ValueError as error:
             raise ValueError(f"{path} is damaged: {error}") from error
 
@@ -205,28 +194,3 @@ def pool(
     values *= weight[:, None]
     begins = np.flatnonzero(np.diff(owner, prepend=-1))
     sums[owner[begins]] = np.add.reduceat(values, begins, axis=0)
-
-
-def _float32(values: NDArray[np.floating]) -> Float32Array:
-    return np.array(values, np.float32, order="C")
-
-
-def _check(name: str, layers: Layers) -> tuple[int, int]:
-    """Return the widths before and after the layers of one part.
-
-    Raises:
-        ValueError: The shapes do not chain, or a number is not finite.
-    """
-    if not layers:
-        raise ValueError(f"the part {name!r} has no layers")
-    inputs = width = len(layers[0][0])
-    for index, (weight, bias) in enumerate(layers):
-        if weight.ndim != 2 or weight.shape[0] != width or bias.shape != weight.shape[1:]:
-            raise ValueError(
-                f"layer {index} of {name} has weights {weight.shape} and biases {bias.shape}, "
-                f"which do not follow a width of {width}"
-            )
-        if not (np.all(np.isfinite(weight)) and np.all(np.isfinite(bias))):
-            raise ValueError(f"layer {index} of {name} holds numbers that are not finite")
-        width = weight.shape[1]
-    return inputs, width

@@ -6,6 +6,7 @@ weights that an uninterrupted one gives, bit for bit on the same machine.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from abc import ABC, abstractmethod
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     import torch
 
 IntArray = NDArray[np.intp]
+FloatArray = NDArray[np.float64]
 
 
 class FitSettings(Protocol):
@@ -62,6 +64,22 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def dense(widths: Sequence[int], activation: type[torch.nn.Module]) -> torch.nn.Sequential:
+    """Return fully connected layers of these widths, the activation after each."""
+    import torch
+
+    layers: list[torch.nn.Module] = []
+    for width, following in itertools.pairwise(widths):
+        layers += [torch.nn.Linear(width, following), activation()]
+    return torch.nn.Sequential(*layers)
+
+
+def layers_in(module: torch.nn.Module) -> list[tuple[FloatArray, FloatArray]]:
+    """Return weights (inputs, outputs) and biases of fully connected layers, in float64."""
+    state = [value.detach().numpy().astype(np.float64) for value in module.parameters()]
+    return [(weight.T, bias) for weight, bias in zip(state[0::2], state[1::2], strict=True)]
 
 
 class Fit(ABC, Generic[Settings]):

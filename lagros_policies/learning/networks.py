@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,13 @@ from lagros_envs.files import write_atomic
 from lagros_envs.reading import check_file
 
 Float32Array = NDArray[np.float32]
+Tensors = dict[str, Float32Array]
+# Weights (inputs, outputs) and biases (outputs,) of each layer.
+Layers = Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
 
 _FORMAT = "lagros-mlp-1"
 _CHECKSUM = "sha256"
+_LAYER = "layer"
 
 
 class Mlp:
@@ -44,20 +48,10 @@ class Mlp:
         """Copy the layers to float32."""
         if not weights or len(weights) != len(biases):
             raise ValueError(f"{len(weights)} weight matrices need as many biases")
-        self.weights = [np.array(weight, np.float32, order="C") for weight in weights]
-        self.biases = [np.array(bias, np.float32, order="C") for bias in biases]
+        layers = checked_layers(list(zip(weights, biases, strict=True)))
+        self.weights, self.biases = [one for one, _ in layers], [other for _, other in layers]
         self.metadata = dict(metadata or {})
-        width = self.weights[0].shape[0] if self.weights[0].ndim == 2 else -1
-        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            if weight.ndim != 2 or weight.shape[0] != width or bias.shape != weight.shape[1:]:
-                raise ValueError(
-                    f"layer {index} has weights {weight.shape} and biases {bias.shape}, "
-                    f"which do not follow a layer of width {width}"
-                )
-            if not (np.all(np.isfinite(weight)) and np.all(np.isfinite(bias))):
-                raise ValueError(f"layer {index} holds numbers that are not finite")
-            width = weight.shape[1]
-        self._hidden = list(zip(self.weights, self.biases, strict=True))[:-1]
+        self._hidden = layers[:-1]
         # Buffers of the hidden layers that no evaluation is using: several threads may evaluate.
         self._free = [self._new_buffers()]
 
@@ -110,11 +104,9 @@ class Mlp:
 
     def save(self, path: Path | str) -> None:
         """Write weights and metadata as safetensors, atomically."""
-        tensors: dict[str, Float32Array] = {}
-        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            tensors[f"layer{index}.weight"] = weight
-            tensors[f"layer{index}.bias"] = bias
-        write_safetensors(path, tensors, {**self.metadata, "format": _FORMAT, "activation": "tanh"})
+        layers = list(zip(self.weights, self.biases, strict=True))
+        metadata = {**self.metadata, "format": _FORMAT, "activation": "tanh"}
+        write_safetensors(path, tensors_of({_LAYER: layers}), metadata)
 
     @classmethod
     def load(cls, path: Path | str) -> Mlp:
@@ -129,25 +121,68 @@ class Mlp:
             raise ValueError(
                 f"{path} is not a network of this package: its metadata say {shown(metadata)}"
             )
-        layers = range(len(tensors) // 2)
-        names = [f"layer{index}.{part}" for index in layers for part in ("weight", "bias")]
-        if sorted(names) != sorted(tensors):
-            raise ValueError(
-                f"{path} holds the tensors {shown(sorted(tensors))}, which are no layers"
-            )
+        (layers,) = layers_of(path, tensors, (_LAYER,))
         try:
-            return cls(
-                [tensors[name] for name in names[0::2]],
-                [tensors[name] for name in names[1::2]],
-                metadata,
-            )
+            return cls([weight for weight, _ in layers], [bias for _, bias in layers], metadata)
         except ValueError as error:
             raise ValueError(f"{path} is damaged: {error}") from error
 
 
-def write_safetensors(
-    path: Path | str, tensors: dict[str, Float32Array], metadata: dict[str, str]
-) -> None:
+def checked_layers(layers: Layers, of: str = "") -> list[tuple[Float32Array, Float32Array]]:
+    """Return copies of layers in float32.
+
+    Args:
+        layers: One at least.
+        of: Of which part of a network they are, for the message.
+
+    Raises:
+        ValueError: There are none, their shapes do not chain, or a number is not finite.
+    """
+    if not layers:
+        raise ValueError(f"the network has no layers{of}")
+    width = np.shape(layers[0][0])[0] if np.ndim(layers[0][0]) == 2 else -1
+    copies = []
+    for index, layer in enumerate(layers):
+        weight, bias = (np.array(part, np.float32, order="C") for part in layer)
+        if weight.ndim != 2 or weight.shape[0] != width or bias.shape != weight.shape[1:]:
+            raise ValueError(
+                f"layer {index}{of} has weights {weight.shape} and biases {bias.shape}, "
+                f"which do not follow a layer of width {width}"
+            )
+        if not (np.all(np.isfinite(weight)) and np.all(np.isfinite(bias))):
+            raise ValueError(f"layer {index}{of} holds numbers that are not finite")
+        width = weight.shape[1]
+        copies.append((weight, bias))
+    return copies
+
+
+def tensors_of(parts: Mapping[str, Sequence[tuple[Float32Array, Float32Array]]]) -> Tensors:
+    """Return the tensors of a file: weights and biases of the layers of each part, by its name."""
+    return {
+        f"{part}{index}.{name}": tensor
+        for part, layers in parts.items()
+        for index, layer in enumerate(layers)
+        for name, tensor in zip(("weight", "bias"), layer, strict=True)
+    }
+
+
+def layers_of(path: Path | str, tensors: Tensors, parts: Sequence[str]) -> list[Layers]:
+    """Return the layers of each part, whose tensors are named as `tensors_of` does.
+
+    Raises:
+        ValueError: A tensor belongs to none of them.
+    """
+    counts = [sum(name.startswith(part) for name in tensors) // 2 for part in parts]
+    names = [
+        [(f"{part}{index}.weight", f"{part}{index}.bias") for index in range(count)]
+        for part, count in zip(parts, counts, strict=True)
+    ]
+    if sorted(tensors) != sorted(name for part in names for layer in part for name in layer):
+        raise ValueError(f"{path} holds the tensors {shown(sorted(tensors))}, which are no layers")
+    return [[(tensors[weight], tensors[bias]) for weight, bias in part] for part in names]
+
+
+def write_safetensors(path: Path | str, tensors: Tensors, metadata: dict[str, str]) -> None:
     """Write tensors, metadata and their checksum, whole or not at all; equal ones, equal files."""
     from safetensors.numpy import save
 
@@ -162,7 +197,7 @@ def write_safetensors(
     write_atomic(path, len(text).to_bytes(8, "little") + text + data[end:])
 
 
-def read_safetensors(path: Path | str) -> tuple[dict[str, Float32Array], dict[str, str]]:
+def read_safetensors(path: Path | str) -> tuple[Tensors, dict[str, str]]:
     """Read tensors and metadata; nothing in such a file is executed.
 
     Raises:
@@ -196,7 +231,7 @@ def read_safetensors(path: Path | str) -> tuple[dict[str, Float32Array], dict[st
         return {key: tensor.astype(np.float32) for key, tensor in tensors.items()}, metadata
 
 
-def _checksum(tensors: dict[str, Float32Array], metadata: dict[str, str]) -> str:
+def _checksum(tensors: Tensors, metadata: dict[str, str]) -> str:
     digest = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
     for name, tensor in sorted(tensors.items()):
         digest.update(f"{name} {tensor.dtype} {tensor.shape}".encode())

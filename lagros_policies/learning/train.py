@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_each, check_fields, check_positive, check_seed, check_whole
-from lagros_policies.learning.fitting import Fit, IntArray, one_thread
+from lagros_policies.learning.fitting import Fit, IntArray, dense, layers_in, one_thread
 from lagros_policies.learning.networks import Mlp
 
 if TYPE_CHECKING:
@@ -131,10 +130,7 @@ class _Run(Fit[TrainingSettings]):
         self.labels = torch.from_numpy((labels - self.output_mean) / self.output_scale)
         torch.manual_seed(settings.seed)
         widths = [features.shape[1], *settings.hidden, labels.shape[1]]
-        layers: list[torch.nn.Module] = []
-        for width, following in itertools.pairwise(widths):
-            layers += [torch.nn.Linear(width, following), torch.nn.Tanh()]
-        self.model = torch.nn.Sequential(*layers[:-1])
+        self.model = dense(widths, torch.nn.Tanh)[:-1]
         data = hashlib.sha256(features.tobytes() + labels.tobytes()).hexdigest()
         super().__init__(settings, checkpoint, list(self.model.parameters()), len(features), data)
 
@@ -154,8 +150,7 @@ class _Run(Fit[TrainingSettings]):
 
     def network(self) -> Mlp:
         """Return the network with the normalisation folded into its first and last layer."""
-        state = [tensor.detach().numpy().astype(np.float64) for tensor in self.model.parameters()]
-        weights, biases = [w.T for w in state[0::2]], state[1::2]
+        weights, biases = (list(part) for part in zip(*layers_in(self.model), strict=True))
         weights[0] = weights[0] / self.input_scale[:, None]
         biases[0] = biases[0] - self.input_mean @ weights[0]
         weights[-1] = weights[-1] * self.output_scale

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import check_each, check_fields, check_positive, check_seed, check_whole
 from lagros_policies.learning.deep_set import DeepSet, Elements, SetFeatures
-from lagros_policies.learning.fitting import Fit, IntArray, one_thread
+from lagros_policies.learning.fitting import Fit, IntArray, dense, layers_in, one_thread
 
 if TYPE_CHECKING:
     import torch
@@ -172,11 +171,11 @@ class _Run(Fit[DeepSetTraining]):
         self.neighbours = _Ragged(features.neighbours, neighbours, count)
         self.obstacles = _Ragged(features.obstacles, obstacles, count)
         torch.manual_seed(settings.seed)
-        wide = settings.element[-1]
+        wide, relu = settings.element[-1], torch.nn.ReLU
         self.parts = [
-            _layers([neighbours.shape[1], *settings.element]),
-            _layers([obstacles.shape[1], *settings.element]),
-            _layers([own.shape[1] + 2 * wide, *settings.agent, self.target.shape[1]])[:-1],
+            dense([neighbours.shape[1], *settings.element], relu),
+            dense([obstacles.shape[1], *settings.element], relu),
+            dense([own.shape[1] + 2 * wide, *settings.agent, self.target.shape[1]], relu)[:-1],
         ]
         data = hashlib.sha256()
         for array in (own, neighbours, obstacles, self.target):
@@ -210,10 +209,7 @@ class _Run(Fit[DeepSetTraining]):
 
     def network(self) -> DeepSet:
         """Return the network with the normalisation folded into its first and last layers."""
-        parts: list[list[tuple[FloatArray, FloatArray]]] = []
-        for module in self.parts:
-            state = [value.detach().numpy().astype(np.float64) for value in module.parameters()]
-            parts.append([(w.T, b) for w, b in zip(state[0::2], state[1::2], strict=True)])
+        parts = [layers_in(module) for module in self.parts]
         scaled = zip((parts[2], parts[0], parts[1]), self.scales, strict=True)
         for part, (mean, deviation) in scaled:
             first, width = part[0][0].copy(), len(mean)
@@ -222,15 +218,6 @@ class _Run(Fit[DeepSetTraining]):
         weight, bias = parts[2][-1]
         parts[2][-1] = weight * self.target_scale, bias * self.target_scale
         return DeepSet(parts[0], parts[1], parts[2])
-
-
-def _layers(widths: list[int]) -> torch.nn.Sequential:
-    import torch
-
-    layers: list[torch.nn.Module] = []
-    for width, following in itertools.pairwise(widths):
-        layers += [torch.nn.Linear(width, following), torch.nn.ReLU()]
-    return torch.nn.Sequential(*layers)
 
 
 def _statistics(values: Float32Array) -> tuple[Float32Array, Float32Array]:
