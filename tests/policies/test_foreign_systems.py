@@ -406,7 +406,6 @@ def spacecraft_calls(body: Any) -> Iterator[tuple[Callable[..., Any], Callable[[
     for function, ask in {
         thrusters.allocate: lambda f: f(body, wrench),
         thrusters.allocation_matrix: lambda f: f(body),
-        thrusters.least_effort: lambda f: f(body, wrench),
         thrusters.wrench_of_acceleration: lambda f: f(body, state, wrench),
         thrusters.thrust_for_acceleration: lambda f: f(body, state, wrench),
         thrusters.held_thrust: lambda f: f(body, state, wrench, 0.1),

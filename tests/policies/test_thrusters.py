@@ -10,7 +10,6 @@ from lagros_envs.dynamics import hold_step, vector_field
 from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.tasks.spacecraft.thrusters import (
     allocate,
-    least_effort,
     thrust_for_acceleration,
     to_body,
     wrench_of_acceleration,
@@ -29,6 +28,12 @@ def thruster_matrix(body):
         [[-1, -1, 0, 0, 1, 1, 0, 0], [0, 0, -1, -1, 0, 0, 1, 1], [-a, a, -b, b, -a, a, -b, b]],
         dtype=float,
     )
+
+
+def least_effort(body, wrench):
+    """Return min ||u||^2 in closed form, shape (...)."""
+    lever = 2.0 * (body.arm**2 + body.side_arm**2)
+    return 0.5 * np.sum(wrench[..., :2] ** 2, axis=-1) + wrench[..., 2] ** 2 / lever
 
 
 def least_thrust(matrix, wrench):

@@ -59,14 +59,6 @@ def allocation_matrix(body: Spacecraft) -> FloatArray:
     return matrix
 
 
-def least_effort(body: Spacecraft, wrench: FloatArray) -> FloatArray:
-    """Return min ||u||^2 for wrenches (..., 3), shape (...) [N^2]."""
-    check_spacecraft(body, "least_effort")
-    lever = 2.0 * (body.arm**2 + body.side_arm**2)
-    effort: FloatArray = 0.5 * np.sum(wrench[..., :2] ** 2, axis=-1) + wrench[..., 2] ** 2 / lever
-    return effort
-
-
 def to_body(force: FloatArray, heading: FloatArray) -> FloatArray:
     """Turn forces (..., 2) from the world's axes into the body's at headings (...) [rad]."""
     sine, cosine = np.sin(heading), np.cos(heading)
