@@ -6,6 +6,7 @@ turns the episodes into the rows of the published tables. `lagros_benchmarks.com
 from a terminal.
 """
 
+import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -45,3 +46,20 @@ def __getattr__(name: str) -> Any:
     from importlib import import_module
 
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+class _OldNames:
+    """Finds modules that have moved, where nobody else finds any; see `lagros_envs.aliases`."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any = None, target: Any = None) -> Any:
+        """Return where a module of this package has moved to; None for any other."""
+        if not name.startswith(f"{__name__}."):
+            return None
+        from lagros_benchmarks.tasks.moved import MOVED
+        from lagros_envs.aliases import Moved
+
+        return Moved(MOVED).find_spec(name)
+
+
+sys.meta_path.append(_OldNames)

@@ -5,6 +5,7 @@ SDC matrix for any system; `check` tries a system of your own on every kind of n
 `straight_line`, `held` and `compiled` run a held step without the overhead of calling the two.
 """
 
+from lagros_envs.aliases import moved_names
 from lagros_envs.dynamics.check import check_system
 from lagros_envs.dynamics.integrate import hold_control_slope, hold_step, linearise_hold
 from lagros_envs.dynamics.system import (
@@ -17,6 +18,7 @@ from lagros_envs.dynamics.system import (
     vector_field,
 )
 
+__getattr__ = moved_names(__name__)
 __all__ = [
     "Components",
     "Functions",

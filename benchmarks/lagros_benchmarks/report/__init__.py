@@ -1,1 +1,5 @@
 """Rows, tables, figures and films of what was run."""
+
+from lagros_envs.aliases import moved_names
+
+__getattr__ = moved_names(__name__)
