@@ -333,6 +333,12 @@ class Task(Described):
         """Largest u, shape (m,)."""
         return (math.inf,) * self.system.control_dim
 
+    @property
+    def control_unit(self) -> str:
+        """The unit of all controls; "" where they have none, or several."""
+        units = {name.partition("[")[2].rstrip("]") for name in self.control_names}
+        return units.pop() if len(units) == 1 else ""
+
     def control(self, action: FloatArray) -> FloatArray:
         """Return u of actions (..., m), as the environment applies it."""
         with np.errstate(over="ignore"):

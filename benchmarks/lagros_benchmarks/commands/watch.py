@@ -15,7 +15,7 @@ from lagros_benchmarks.commands.terminal import fail, find_users_modules, refuse
 
 
 def watch(
-    task: Annotated[str, typer.Argument(help="cartpole or spacecraft.")],
+    task: Annotated[str, typer.Argument(help="As for `lagros bench`.")],
     policy: Annotated[
         str,
         typer.Option(
@@ -24,7 +24,7 @@ def watch(
         ),
     ] = "lagros",
     agents: Annotated[
-        int | None, typer.Option(help="Number of spacecraft; the preset's own if not given.")
+        int | None, typer.Option(help="Number of agents; the preset's own if not given.")
     ] = None,
     preset: Annotated[
         str | None,
@@ -37,8 +37,8 @@ def watch(
     bound: Annotated[
         float | None,
         typer.Option(
-            help="Bound d̄ of the disturbance, in units of the state per second. "
-            "(default: 0.75 for cartpole, 0.4 for spacecraft)"
+            help="Bound d̄ of the disturbance, in units of the state per second; the task's own "
+            "if not given."
         ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
@@ -62,8 +62,7 @@ def watch(
     speed: Annotated[
         float | None,
         typer.Option(
-            help="How much faster than real time it plays. (default: 1 for cartpole, 4 for "
-            "spacecraft)"
+            help="How much faster than real time it plays; the task's own if not given."
         ),
     ] = None,
     seconds: Annotated[

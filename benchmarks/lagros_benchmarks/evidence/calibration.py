@@ -102,15 +102,9 @@ def pretrained_hash(task: str, *settings: object, folder: Path | None = None) ->
     return digest.hexdigest()[:_DIGITS]
 
 
-def control_unit(task: Task) -> str:
-    """Return the unit of the controls, "" where they have none or several."""
-    units = {name.partition("[")[2].rstrip("]") for name in task.control_names}
-    return units.pop() if len(units) == 1 else ""
-
-
 def scores_of(task: Task) -> tuple[Score, ...]:
     """Return what is bounded of the episodes of a task."""
-    error = Score("learning_error", "the largest ||u_L - u*|| of an episode", control_unit(task))
+    error = Score("learning_error", "the largest ||u_L - u*|| of an episode", task.control_unit)
     share = (TUBE_SHARE,) if task.tube_radius(0.0) is not None else ()
     return (error, TUBE, *share, *((POSITION,) if task.position else ()))
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_benchmarks.evidence.calibration import control_unit, single_statements
+from lagros_benchmarks.evidence.calibration import single_statements
 from lagros_benchmarks.evidence.records import recorded_error, recorded_statement
 from lagros_benchmarks.worst_case.certificate import sampled_gain
 from lagros_benchmarks.worst_case.flights import (
@@ -118,7 +118,7 @@ def certify(task: Task, question: Question) -> Certificate:
     lines = [_condition(metric), _feasible(task, metric)]
     error = recorded_error(task, question.policy) if learned else 0.0
     if learned:
-        lines.append(recorded_statement(task, question.policy, control_unit(task)))
+        lines.append(recorded_statement(task, question.policy, task.control_unit))
     observed = None
     if question.episodes:
         flights = fly_kinds(task, question.policy, question.bound, question.episodes)
@@ -236,7 +236,7 @@ def met_error(
     samples = Samples(state[counted], nominal[counted], flights.nominal[counted])
     distance = contraction_distance(task.system, metric, samples, flights.controls[counted])
     largest = float(distance.max(initial=0.0))
-    within = " ".join(part for part in (f"{largest:.4g}", control_unit(task)) if part)
+    within = " ".join(part for part in (f"{largest:.4g}", task.control_unit) if part)
     text = (
         f"at the {len(distance)} instants of {len(state)} episodes that lay in the region, the "
         f"control was within {within} of one that contracts in this metric"

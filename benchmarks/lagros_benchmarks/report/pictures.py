@@ -75,34 +75,6 @@ class SinglePictures:
         self._renderer.close()
 
 
-class SpacecraftPictures:
-    """Draws a world of spacecraft at the control instants.
-
-    Args:
-        env: The environment; somebody else resets it and takes its steps.
-        render_mode: "human" opens a window; "rgb_array" draws without one.
-        rate: Frames per second at which a window plays.
-
-    Raises:
-        ImportError: pygame is not installed.
-    """
-
-    def __init__(self, env: Any, render_mode: str, rate: float) -> None:
-        """Open the window, or what draws without one."""
-        from lagros_envs.tasks.spacecraft.draw import SpacecraftRenderer
-
-        self._env = env
-        self._renderer = SpacecraftRenderer(render_mode, max(1, round(rate)), env.preset.arena)
-
-    def draw(self) -> Frame | None:
-        """Draw the world as it is; the frame, or None in a window."""
-        return self._renderer.draw(self._env.episode.world)
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self._renderer.close()
-
-
 def _between(nominal: FloatArray, steps: float) -> FloatArray:
     """Return x_d after so many control steps, on the line between two of them."""
     last = len(nominal) - 1

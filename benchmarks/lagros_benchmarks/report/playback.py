@@ -11,8 +11,8 @@ from typing import Any
 
 import lagros_envs  # noqa: F401  (registers the environments)
 from lagros_benchmarks.report.video import FRAME_RATES, Frame, check_video_path, video_bytes
-from lagros_benchmarks.report.watched import CartPoleGame, SpacecraftGame
 from lagros_benchmarks.run.flying import Attempt
+from lagros_benchmarks.run.room import room_of
 from lagros_benchmarks.run.settings import check_policy, unknown_name
 from lagros_envs.canvas import import_pygame
 from lagros_envs.checks import (
@@ -23,11 +23,9 @@ from lagros_envs.checks import (
     check_whole,
 )
 from lagros_envs.disturbances import KINDS
-from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS
+from lagros_envs.registry import task_named
+from lagros_envs.task import Described
 
-TASKS = ("cartpole", "spacecraft")
-BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
-SPEEDS = {"cartpole": 1.0, "spacecraft": 4.0}
 # Slower films would have pictures without end, faster ones none.
 SLOWEST, FASTEST = 0.05, 1000.0
 # "worst" needs a metric and a plan, which not every policy has.
@@ -41,25 +39,25 @@ class WatchSettings:
     """What to watch.
 
     Attributes:
-        task: One of `TASKS`.
+        task: As in `lagros watch TASK`.
         policy: A name of the task's policies, a stable-baselines3 zip, or module:Class.
-        agents: Number of spacecraft; None takes the scenario's or the preset's own.
-        preset: Of `lagros_envs.tasks.spacecraft.scenarios.PRESETS`; None takes "paper".
+        agents: Number of agents; None takes the scenario's or the preset's own.
+        preset: Of the task's presets; None takes its default.
         disturbance: Of `WATCHED_KINDS`.
-        bound: d_bar, in units of the state per second; None takes that of `BOUNDS`.
+        bound: d_bar, in units of the state per second; None takes the task's own.
         seed: Seed of the episode, as for `env.reset`.
         scenario: File that `Scenario.save` has written; None draws one from the preset.
-        safety_filter: Whether the policy wears the safety filter.
+        safety_filter: Whether the policy uses the safety filter.
         video: File to write; None opens a window.
-        speed: How much faster than real time it plays; None takes that of `SPEEDS`.
+        speed: How much faster than real time it plays; None takes the task's own.
         seconds: End after so much time of the episode [s]; None plays to its end.
 
     Raises:
-        ValueError: A value is not valid, or is of the other task.
+        ValueError: A value is not valid, or is of worlds of many agents and the task is of one body.
         ImportError: What writes the video is not installed.
     """
 
-    task: str = "spacecraft"
+    task: str
     policy: str = "lagros"
     agents: int | None = None
     preset: str | None = None
@@ -75,15 +73,20 @@ class WatchSettings:
     def __post_init__(self) -> None:
         """Check the values."""
         check_fields(self)
-        if self.task not in TASKS:
-            raise ValueError(unknown_name("task", self.task, TASKS))
+        presets, most = self.described.presets, self.described.most_agents
         check_policy(self.policy, self.task)
         if self.disturbance not in WATCHED_KINDS:
             raise ValueError(unknown_name("disturbance", self.disturbance, WATCHED_KINDS))
-        if self.preset is not None and self.preset not in PRESETS:
-            raise ValueError(unknown_name("preset", self.preset, PRESETS))
+        for name in ("agents", "preset", "scenario", "safety_filter") if most == 1 else ():
+            if getattr(self, name):
+                option = name.replace("_", "-")
+                raise ValueError(
+                    f"--{option} is for worlds of many agents; leave it out for {self.task}"
+                )
+        if self.preset is not None and self.preset not in presets:
+            raise ValueError(unknown_name("preset", self.preset, presets))
         if self.agents is not None:
-            check_whole("agents", self.agents, 1, MOST_AGENTS)
+            check_whole("agents", self.agents, 1, most)
         check_seed(self.seed)
         if self.bound is not None:
             check_disturbance_bound("bound", self.bound)
@@ -95,23 +98,23 @@ class WatchSettings:
                 )
         if self.seconds is not None:
             check_positive("seconds", self.seconds)
-        if self.task == "cartpole":
-            for name in ("agents", "preset", "scenario", "safety_filter"):
-                if getattr(self, name):
-                    option = name.replace("_", "-")
-                    raise ValueError(f"--{option} is of the spacecraft; leave it out for cartpole")
         if self.video is not None:
             check_video_path(self.video)
 
     @property
+    def described(self) -> Described:
+        """The task."""
+        return task_named(self.task)
+
+    @property
     def disturbance_bound(self) -> float:
         """d_bar, given or the task's own."""
-        return BOUNDS[self.task] if self.bound is None else self.bound
+        return self.described.defaults.bound if self.bound is None else self.bound
 
     @property
     def playing_speed(self) -> float:
         """How much faster than real time it plays, given or the task's own."""
-        return SPEEDS[self.task] if self.speed is None else self.speed
+        return self.described.defaults.speed if self.speed is None else self.speed
 
 
 class Playback:
@@ -134,9 +137,7 @@ class Playback:
         import_pygame()
         self.settings = settings
         self.frames = 0
-        self._game: CartPoleGame | SpacecraftGame = (
-            CartPoleGame(settings) if settings.task == "cartpole" else SpacecraftGame(settings)
-        )
+        self._game: Any = room_of(settings.described).part("game")(settings)
         task = self._game.env.settings
         whole: int = task.steps
         self._period: float = task.control_period
