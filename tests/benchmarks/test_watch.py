@@ -15,9 +15,10 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from lagros_benchmarks.commands import cli
-from lagros_benchmarks.report import video, watched
+from lagros_benchmarks.report import video
 from lagros_benchmarks.report.pictures import SinglePictures
 from lagros_benchmarks.report.playback import Playback, WatchSettings
+from lagros_benchmarks.tasks.spacecraft import game
 from lagros_envs import spacecraft_v0
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
@@ -291,7 +292,9 @@ def test_a_scenario_of_ones_own_is_played(invoke, tmp_path):
 
 
 def test_a_policy_that_plans_is_shown_with_its_plan(invoke, tmp_path):
-    film = Playback(WatchSettings(policy="pilots:Planner", agents=2, video=tmp_path / "x.gif"))
+    film = Playback(
+        WatchSettings("spacecraft", policy="pilots:Planner", agents=2, video=tmp_path / "x.gif")
+    )
     film._game.start("rgb_array", 10.0)
     world = film._game.env.episode.world
     film._game.step()
@@ -339,13 +342,13 @@ def test_without_a_file_a_window_shows_it(invoke, monkeypatch):
 
 def test_closing_the_window_ends_the_episode(invoke, monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    closing = watched.SpacecraftGame.step
+    closing = game.SpacecraftGame.step
 
     def step(self):
         pygame.event.post(pygame.event.Event(pygame.QUIT))
         return closing(self)
 
-    monkeypatch.setattr(watched.SpacecraftGame, "step", step)
+    monkeypatch.setattr(game.SpacecraftGame, "step", step)
     result = invoke("spacecraft", "--policy", "pilots:Pilot", "--agents", 2, "--speed", 50)
     assert result.exit_code == 0, result.output
     # It is asked after every frame: here, every twentieth control step.
@@ -380,8 +383,8 @@ def test_where_no_window_opens_the_option_is_named(invoke, monkeypatch):
         (("spacecraft", "--seed", "-1"), "seed=-1 must be"),
         (("spacecraft", "--disturbance", "worst"), "Valid: none, uniform, sphere"),
         (("spacecraft", "--scenario", "none.json"), "none.json"),
-        (("cartpole", "--agents", "2"), "--agents is of the spacecraft"),
-        (("cartpole", "--safety-filter"), "--safety-filter is of the spacecraft"),
+        (("cartpole", "--agents", "2"), "--agents is for worlds of many agents"),
+        (("cartpole", "--safety-filter"), "--safety-filter is for worlds of many agents"),
         (("spacecraft", "--policy", "pilots:Nobody"), "pilots:Nobody"),
         (("cartpole", "--policy", "lqrr"), "Did you mean 'lqr'?"),
     ],

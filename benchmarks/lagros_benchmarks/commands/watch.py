@@ -61,9 +61,7 @@ def watch(
     ] = None,
     speed: Annotated[
         float | None,
-        typer.Option(
-            help="How much faster than real time it plays; the task's own if not given."
-        ),
+        typer.Option(help="How much faster than real time it plays; the task's own if not given."),
     ] = None,
     seconds: Annotated[
         float | None, typer.Option(help="End after so many seconds of the episode.")

@@ -108,7 +108,8 @@ def certify(task: Task, question: Question) -> Certificate:
     """
     if question.largest:
         raise UnservedError(f"--largest: there is no proof for {task.name} whose region could grow")
-    metric = expert_of(task).metric if question.metric is None else load_metric(question.metric)
+    own = question.metric
+    metric: Any = expert_of(task).metric if own is None else load_metric(own)
     if metric is None:
         raise UnservedError(
             f"{task.name} has no metric, and a certificate is about one: give the task a "

@@ -53,7 +53,8 @@ class WatchSettings:
         seconds: End after so much time of the episode [s]; None plays to its end.
 
     Raises:
-        ValueError: A value is not valid, or is of worlds of many agents and the task is of one body.
+        ValueError: A value is not valid, or is for worlds of many agents and the task is of one
+            body.
         ImportError: What writes the video is not installed.
     """
 
@@ -170,7 +171,8 @@ class Playback:
     @property
     def error(self) -> str | None:
         """What the policy raised; None if nothing."""
-        return self._game.error
+        error: str | None = self._game.error
+        return error
 
     def close(self) -> None:
         """Close the window, if there is one."""

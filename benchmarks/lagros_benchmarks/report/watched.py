@@ -14,6 +14,7 @@ from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.library import make_single_policy
 from lagros_benchmarks.worst_case.flights import plan_of
+from lagros_policies.planning.planner import planner_of
 
 if TYPE_CHECKING:
     from lagros_benchmarks.report.playback import WatchSettings
@@ -42,8 +43,8 @@ class SingleGame:
 
     def start(self, render_mode: str, rate: float) -> None:
         """Begin the episode, with its plan, and open the window or what draws without one."""
-        plan = plan_of(self.env.settings, self.env.scenario)
-        options = {} if plan is None else {"nominal": np.asarray(plan.states)}
+        plan = plan_of(planner_of(self.env.settings), self.env.scenario)
+        options = {"nominal": np.asarray(plan.states)} if plan.solved else {}
         self._loop.begin(self._seed, options)
         # Only now: a window would stand still while this plans.
         self._pictures = SinglePictures(self.env, render_mode, rate)

@@ -21,7 +21,10 @@ from lagros_envs.dynamics import hold_step
 from lagros_envs.numbers import functions
 from lagros_envs.seeding import episode_streams
 from lagros_envs.sweep import closest_approach
-from lagros_envs.task import LARGEST_DISTANCE, Task, distance_between
+from lagros_envs.task import LARGEST_DISTANCE, Scenario, Task, distance_between
+from lagros_policies.expert import Expert
+from lagros_policies.planning.planner import Planner, planner_of
+from lagros_policies.planning.trajectory import Trajectory
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -91,11 +94,34 @@ def parts_of(states: FloatArray) -> list[FloatArray]:
     return list(np.moveaxis(states, -1, 0))
 
 
-def expert_of(task: Task) -> Any:
-    """Return the planner and the law u* of a task."""
-    from lagros_policies.tasks.cartpole.expert import CartPoleExpert
+@dataclass(frozen=True)
+class Planning:
+    """What stands in for the expert of a task without a metric: its planner, and no law.
 
-    return CartPoleExpert(task=task)  # type: ignore[arg-type]
+    Attributes:
+        task: The task.
+        planner: Its planner.
+    """
+
+    task: Task
+    planner: Planner
+    metric: None = None
+
+
+def expert_of(task: Task) -> Expert | Planning:
+    """Return planner and law u* of a task; the planner alone where it describes no metric.
+
+    Raises:
+        FileNotFoundError: Its metric has not been made.
+    """
+    if task.metric is None and task.room is None:
+        return Planning(task, planner_of(task))
+    return Expert(task)
+
+
+def plan_of(planner: Planner, scenario: Scenario) -> Trajectory:
+    """Return the plan of a scenario from its start."""
+    return planner.plan(scenario.initial_state, scenario.goal, discs=scenario.discs)
 
 
 def draw_episodes(expert: Any, seeds: Sequence[int]) -> Episodes:
@@ -112,8 +138,7 @@ def draw_episodes(expert: Any, seeds: Sequence[int]) -> Episodes:
     planned = []
     for seed in seeds:
         one = settings.sample(episode_streams(seed).scenario)
-        with_discs = (one.discs,) if len(one.discs) else ()
-        planned.append((seed, one, expert.planner.plan(one.initial_state, one.goal, *with_discs)))
+        planned.append((seed, one, plan_of(expert.planner, one)))
     solved = [entry for entry in planned if entry[2].solved]
     if not solved:
         raise RuntimeError(f"none of the {len(seeds)} episodes has a plan")

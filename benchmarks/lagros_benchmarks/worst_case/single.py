@@ -204,8 +204,10 @@ class SingleBench:
         self.episodes = draw_episodes(self.expert, self.settings.episode_seeds())
         self.certificate = self.check_of()
 
-    def check_of(self) -> TubeCheck:
-        """Return the tube of Theorem 1 around the plans."""
+    def check_of(self) -> TubeCheck | None:
+        """Return the tube of Theorem 1 around the plans; None where the task has no metric."""
+        if self.expert.metric is None:
+            return None
         return TubeCheck(self.expert, self.episodes, self.settings.bound)
 
     def law(self) -> Law:
@@ -222,7 +224,7 @@ class SingleBench:
             self.law(),
             self.settings.goal,
             self.settings.bound,
-            energy_adversary(self.expert.metric),
+            None if self.expert.metric is None else energy_adversary(self.expert.metric),
         )
         return search(target, self.settings.search, self.settings.seed)
 
@@ -237,8 +239,9 @@ class SingleBench:
             goal = self.settings.goal
             outcome, flight = replay_single(self.episodes, index, self.policy, goal, one)
             if flight is not None:
-                more = self.certificate.hold(np.array([index]), flight).observed(0)
-                measures = {**outcome.measures, **self.measures(flight), **more}
+                measures = {**outcome.measures, **self.measures(flight)}
+                if self.certificate is not None:
+                    measures |= self.certificate.hold(np.array([index]), flight).observed(0)
                 outcome = replace(outcome, measures=measures)
             outcomes.append(outcome)
         return outcomes
