@@ -10,7 +10,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
-from importlib.machinery import ModuleSpec
+from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
 from typing import Any
 
@@ -59,6 +59,11 @@ class Moved(MetaPathFinder):
     ) -> ModuleSpec | None:
         """Return where a module is now; None for one that has not moved."""
         if name.partition(".")[0] not in self._packages:
+            return None
+        package = name.rpartition(".")[0]
+        unmoved = sys.modules[package].__name__ == package if package in sys.modules else False
+        if name in self._moved and unmoved and PathFinder.find_spec(name, path) is not None:
+            # Another module has this name now.
             return None
         old, below = name, ""
         while old and old not in self._moved:

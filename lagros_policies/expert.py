@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.aliases import moved_names
 from lagros_envs.dynamics import linearise_hold
 from lagros_envs.task import Feedback, Task
 from lagros_policies.contraction import ContractionMetric, HeldControl, load_metric
@@ -22,6 +23,7 @@ from lagros_policies.room import found_file, part_of
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+__getattr__ = moved_names(__name__)
 
 
 @dataclass(frozen=True)

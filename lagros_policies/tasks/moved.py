@@ -2,7 +2,6 @@
 
 _MOVED = {
     "metric_design": "tasks.cartpole.metric_design",
-    "expert": "tasks.cartpole.expert",
     "spacecraft_expert": "tasks.spacecraft.expert",
     "spacecraft_ppo": "tasks.spacecraft.ppo",
     "spacecraft_setup": "tasks.spacecraft.setup",
@@ -49,4 +48,7 @@ _MOVED = {
 }
 MOVED = {f"lagros_policies.{old}": f"lagros_policies.{new}" for old, new in _MOVED.items()}
 # As in `lagros_envs.tasks.moved`.
-NAMES = {"lagros_policies.safety": "lagros_policies.tasks.spacecraft.safety_filter"}
+NAMES = {
+    "lagros_policies.expert": "lagros_policies.tasks.cartpole.expert",
+    "lagros_policies.safety": "lagros_policies.tasks.spacecraft.safety_filter",
+}

@@ -10,6 +10,7 @@ import lagros_envs.tasks.moved
 import lagros_policies.tasks.moved
 from lagros_benchmarks.tasks import moved as moved_benchmarks
 
+FILTER = "lagros_policies.tasks.spacecraft.safety_filter"
 TABLE = {
     **lagros_envs.tasks.moved.MOVED,
     **lagros_policies.tasks.moved.MOVED,
@@ -71,11 +72,8 @@ def test_modules_of_a_package_that_has_moved_are_not_imported_twice():
     [
         ("lagros_envs.dynamics", "CartPole", "lagros_envs.tasks.cartpole.physics"),
         ("lagros_envs.dynamics", "Spacecraft", "lagros_envs.tasks.spacecraft.physics"),
-        (
-            "lagros_policies.safety",
-            "SafetyFilter",
-            "lagros_policies.tasks.spacecraft.safety_filter",
-        ),
+        ("lagros_policies.expert", "CartPoleExpert", "lagros_policies.tasks.cartpole.expert"),
+        ("lagros_policies.safety", "SafetyFilter", FILTER),
         ("lagros_benchmarks.report", "print_report", "lagros_benchmarks.report.delivery"),
     ],
 )
@@ -94,3 +92,11 @@ def test_what_has_never_been_is_not_found():
         importlib.import_module("lagros_benchmarks.nothing")
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         importlib.import_module("lagros_envs.dynamics").nothing  # noqa: B018
+
+
+def test_no_old_name_hides_a_module_that_has_it_now():
+    for old in TABLE:
+        package, _, last = old.rpartition(".")
+        parent = noted(lambda package=package: importlib.import_module(package))[0]
+        if parent.__name__ == package:
+            assert importlib.machinery.PathFinder.find_spec(old, parent.__path__) is None, old
