@@ -1,8 +1,9 @@
-"""A spacecraft policy that is one evaluation of a deep set: the common body of (a) and (c)."""
+"""Policies (a) and (c) of the spacecraft, and what they share with PPO: one evaluation each."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.learning.deep_set import DeepSet, SetFeatures
 from lagros_policies.learning.network_policy import PRETRAINED
+from lagros_policies.learning.networks import Mlp
 from lagros_policies.observed import as_numbers
 from lagros_policies.policy import BasePolicy, PolicyState
 from lagros_policies.tasks.spacecraft.features import NEIGHBOUR, OBSTACLE, OWN, spacecraft_features
@@ -28,23 +30,17 @@ from lagros_policies.trained_for import check_trained_for
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
-# Features of the agent itself, of a neighbour and of an obstacle; accelerations in the frame of the
-# goal and of the heading.
-_INPUTS, _OUTPUTS = (len(OWN), len(NEIGHBOUR), len(OBSTACLE)), 3
 
+class SpacecraftActor(BasePolicy):
+    """A policy of each agent for itself, by one evaluation of a network: what (a), (c), PPO share.
 
-class SpacecraftNetworkPolicy(BasePolicy):
-    """Maps what an agent senses to its eight thrusters by one evaluation of a network.
-
-    The network answers with an acceleration in the frame of the goal; a turn into the body's axes
-    and a fixed last layer with ReLU, the allocation of least norm, make u >= 0 of it. Every row of
-    an observation is an agent of its own: all agents of all worlds fit in one call.
+    Every row of an observation is an agent of its own: all agents of all worlds fit in one call.
 
     Args:
-        settings: The task.
+        settings: The task; None for the paper's.
         preset: The preset, or its name: the size of observations and the radii of the bodies.
         num_agents: Number of agents; None for the preset's own.
-        weights: A safetensors file written by `DeepSet.save`; the shipped one if left out.
+        weights: A file of the network, or the network itself; None for the shipped one.
         allow_other_settings: Fly settings and radii too for which the network was not trained.
 
     Raises:
@@ -53,12 +49,20 @@ class SpacecraftNetworkPolicy(BasePolicy):
             trained for other settings.
 
     Attributes:
+        kind: Of the network.
+        maps: Its inputs and outputs.
+        maker: The command that makes one.
+        trained_in: Presets whose bodies it has met, where the file does not say.
         recorded_as: The policy that the file must name; None takes any.
     """
 
-    name: str = "network"
+    kind: type[DeepSet] | type[Mlp]
+    maps: tuple[Any, int]
+    maker: str
+    trained_in: tuple[str, ...] = PUBLISHED
     weights_file: str
     recorded_as: str | None = None
+    network: Any
     restricted = True  # `policy.make` tells it whether other settings are allowed
 
     def __init__(
@@ -66,29 +70,46 @@ class SpacecraftNetworkPolicy(BasePolicy):
         settings: task.SpacecraftSettings | None = None,
         preset: str | Preset = "paper",
         num_agents: int | None = None,
-        weights: Path | str | None = None,
+        weights: Path | str | DeepSet | Mlp | None = None,
         allow_other_settings: bool = False,
     ) -> None:
         """Load the network."""
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
-        path = PRETRAINED / self.weights_file if weights is None else weights
-        self.network = DeepSet.load(path)
-        if (self.network.inputs, self.network.outputs) != (_INPUTS, _OUTPUTS):
+        given = PRETRAINED / self.weights_file if weights is None else weights
+        ready = isinstance(given, self.kind)
+        what = "the network" if ready else str(given)
+        self.network = given if ready else self.kind.load(cast(Path, given))
+        if (self.network.inputs, self.network.outputs) != self.maps:
             raise ValueError(
-                f"{path} maps {self.network.inputs} features to {self.network.outputs} numbers; a "
-                f"network of the spacecraft maps {_INPUTS} to {_OUTPUTS}"
+                f"{what} maps {self.network.inputs} numbers to {self.network.outputs}; this agent "
+                f"maps {self.maps[0]} to {self.maps[1]}; `{self.maker}` makes such a network"
             )
         check_trained_for(
             self.network.metadata,
-            str(path),
+            what,
             self.recorded_as,
             self.settings,
-            spacecraft_range(task.SpacecraftSettings(), PUBLISHED),
+            spacecraft_range(task.SpacecraftSettings(), self.trained_in),
             allow_other_settings,
             radii_of(self.preset),
         )
-        self._radii = self.preset.agent_radius, self.preset.core
+
+
+class SpacecraftNetworkPolicy(SpacecraftActor):
+    """Maps what an agent senses to its eight thrusters by a deep set.
+
+    The network answers with an acceleration in the frame of the goal; a turn into the body's axes
+    and a fixed last layer with ReLU, the allocation of least norm, make u >= 0 of it.
+    """
+
+    name: str = "network"
+    kind = DeepSet
+    # Features of the agent itself, of a neighbour and of an obstacle; accelerations in the frame of
+    # the goal and of the heading.
+    maps = (len(OWN), len(NEIGHBOUR), len(OBSTACLE)), 3
+    maker = "lagros reproduce spacecraft"
+    network: DeepSet
 
     def predict(
         self,
@@ -117,7 +138,8 @@ class SpacecraftNetworkPolicy(BasePolicy):
 
     def features(self, sensed: Sensed) -> SetFeatures:
         """Return the inputs of the network."""
-        return spacecraft_features(sensed, self.settings, *self._radii)
+        radii = self.preset.agent_radius, self.preset.core
+        return spacecraft_features(sensed, self.settings, *radii)
 
     def bare_forward(self, features: SetFeatures) -> Float32Array:
         """Evaluate the network alone, for timing."""

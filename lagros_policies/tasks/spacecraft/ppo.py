@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.tasks.spacecraft import task
-from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.learning.networks import Mlp
-from lagros_policies.policy import BasePolicy, PolicyState
+from lagros_policies.policy import PolicyState
+from lagros_policies.tasks.spacecraft.network_policy import SpacecraftActor
 from lagros_policies.tasks.spacecraft.sensed import Sensed
-from lagros_policies.tasks.spacecraft.setup import radii_of, spacecraft_range, task_and_preset
 from lagros_policies.tasks.spacecraft.thrusters import allocate
-from lagros_policies.trained_for import check_trained_for
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 
-WEIGHTS = Path(__file__).parents[2] / "pretrained" / "spacecraft_ppo.safetensors"
-TRAINED_IN = ("paper",)  # its features count on the radii of this preset's bodies
 NEAREST = 3  # neighbours, and obstacles, that the agent looks at
 WRENCH = 3  # what it chooses: a force and a torque
 _OWN, _EACH = 5, 8
@@ -158,53 +153,19 @@ def thrust_of(
     return (allocate(settings.system, wrench) / settings.thrust_scale).astype(np.float32)
 
 
-class SpacecraftPpoPolicy(BasePolicy):
+class SpacecraftPpoPolicy(SpacecraftActor):
     """The trained actor, its mean action, for any number of agents.
 
     `lagros train spacecraft --algo ppo` trains it, with six agents in the preset `paper`.
-
-    Args:
-        settings: The task; None for the paper's.
-        preset: The preset, or its name, of the environment.
-        num_agents: Number of agents; None for the preset's own.
-        weights: The file of a training, or the network itself; None for the shipped one.
-        allow_other_settings: Fly settings and radii too for which the agent was not trained.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is damaged, not this agent's, or of a training for other settings.
     """
 
-    name = "ppo"
-    restricted = True  # `policy.make` tells it whether other settings are allowed
-
-    def __init__(
-        self,
-        settings: task.SpacecraftSettings | None = None,
-        preset: str | Preset = "paper",
-        num_agents: int | None = None,
-        weights: Path | str | Mlp | None = None,
-        allow_other_settings: bool = False,
-    ) -> None:
-        """Load the actor."""
-        self.settings, chosen = task_and_preset(settings, preset, num_agents)
-        self.layout = Layout.for_preset(chosen, self.settings)
-        file = WEIGHTS if weights is None else weights
-        self.network = file if isinstance(file, Mlp) else Mlp.load(file)
-        if (self.network.inputs, self.network.outputs) != (FEATURES, WRENCH):
-            raise ValueError(
-                f"the network maps {self.network.inputs} numbers to {self.network.outputs}; this "
-                f"agent maps {FEATURES} to {WRENCH}; `lagros train spacecraft` makes such a network"
-            )
-        check_trained_for(
-            self.network.metadata,
-            "the network" if isinstance(file, Mlp) else str(file),
-            self.name,
-            self.settings,
-            spacecraft_range(task.SpacecraftSettings(), TRAINED_IN),
-            allow_other_settings,
-            radii_of(chosen),
-        )
+    name = recorded_as = "ppo"
+    kind = Mlp
+    maps = FEATURES, WRENCH
+    maker = "lagros train spacecraft"
+    trained_in = ("paper",)  # the features count on the radii of its bodies
+    weights_file = "spacecraft_ppo.safetensors"
+    network: Mlp
 
     def predict(
         self,
