@@ -27,10 +27,10 @@ from lagros_envs.tasks.spacecraft.scenarios import Preset, Scenario
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+from lagros_policies.learning.network_policy import PRETRAINED
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.tasks.spacecraft.ppo import (
     FEATURES,
-    WEIGHTS,
     SpacecraftPpoPolicy,
     look,
     thrust_of,
@@ -431,7 +431,7 @@ def test_it_learns_to_reach_goals(tmp_path):
 
 def test_the_shipped_actor_flies_as_its_record_says():
     """The file and the record are of one run: on the record's own episodes, its own figures."""
-    record = json.loads(WEIGHTS.with_suffix(".json").read_text())
+    record = json.loads((PRETRAINED / "spacecraft_ppo.json").read_text())
     run = default_training("spacecraft", "ppo")
     assert record["training"] == json.loads(json.dumps(run.record()))
     seeds = episode_seeds(0, run.final_episodes, FINAL)

@@ -96,7 +96,7 @@ def test_what_has_never_been_is_not_found():
 
 def test_no_old_name_hides_a_module_that_has_it_now():
     for old in TABLE:
-        package, _, last = old.rpartition(".")
+        package = old.rpartition(".")[0]
         parent = noted(lambda package=package: importlib.import_module(package))[0]
         if parent.__name__ == package:
             assert importlib.machinery.PathFinder.find_spec(old, parent.__path__) is None, old

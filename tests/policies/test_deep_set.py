@@ -239,5 +239,6 @@ def test_a_network_of_other_features_or_answers_is_refused(tmp_path, own, output
     assert (network.inputs, network.outputs) == ((own, 7, 8), outputs)
     path = tmp_path / "other.safetensors"
     network.save(path)
-    with pytest.raises(ValueError, match=rf"other\.safetensors maps .* to {outputs} numbers"):
+    text = rf"other\.safetensors maps .* to {outputs}; .*lagros reproduce"
+    with pytest.raises(ValueError, match=text):
         SpacecraftNetworkPolicy(weights=path)

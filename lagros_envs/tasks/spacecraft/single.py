@@ -29,7 +29,7 @@ Float32Array = NDArray[np.float32]
 class SpacecraftEnv(OneWorld, gym.Env[Float32Array, Float32Array]):
     """One spacecraft that seeks its goal among obstacles, under bounded disturbance.
 
-    The world, action, observation, reward and info of `spacecraft.SpacecraftParallelEnv` with a
+    The world, action, observation, reward and info of `SpacecraftParallelEnv` with a
     single agent: the one slot for a neighbour is always empty. `terminated` at a collision,
     `truncated` at 45 s; the episode goes on after the arrival. `max_episode_steps` of `gym.make` is
     as in `CartPoleEnv`.

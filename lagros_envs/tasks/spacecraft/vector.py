@@ -36,7 +36,7 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
 
     Row `world * num_agents + agent` is that agent of that world, and `reshape(worlds, num_agents,
     ...)` on whatever has a leading axis of rows gives worlds and agents. Spaces, dynamics, reward
-    and info are those of `spacecraft.SpacecraftParallelEnv`; the agents of a world end together.
+    and info are those of `SpacecraftParallelEnv`; the agents of a world end together.
     Seeds, masks and autoreset are those of `autoreset.RestartingVectorEnv`. `reset(options=...)`
     also takes `scenarios` (one `Scenario` or None per world) and `nominal` (worlds, steps + 1,
     num_agents, 6).

@@ -27,7 +27,7 @@ class Outcome(NamedTuple):
     """What one step brought each agent; every array has shape (worlds, agents).
 
     Attributes:
-        reward: See `spacecraft_task.reward`.
+        reward: See `task.reward`.
         terminated: Whether every agent of the world has collided.
         truncated: Whether the time limit is reached.
     """
@@ -214,7 +214,7 @@ class SpacecraftWorld:
     def info(self) -> dict[str, Any]:
         """Return the measures of every agent, each of shape (worlds, agents) or with axes behind.
 
-        `spacecraft.SpacecraftParallelEnv` says what they mean.
+        `SpacecraftParallelEnv` says what they mean.
         """
         distance = self.goal_distance
         collided = self.collided

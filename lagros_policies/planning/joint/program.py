@@ -1,4 +1,4 @@
-"""One quadratic program of the joint planner, `joint_scp`: unknowns, dynamics and half-planes."""
+"""One quadratic program of `solve_joint`: unknowns, dynamics and half-planes."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@
 
 c_j is an obstacle, or another agent extrapolated at constant velocity. The plan always reaches to
 the goal, with short steps as far as others can be foreseen and long ones after that, so that its
-size does not depend on the time that remains. The distances are linearised as in `joint_scp`; all
+size does not depend on the time that remains. The distances are linearised as in `joint.scp`; all
 may be violated at the price phi(s) = w_1 s + w_2 s^2 / 2, whose second term keeps an agent in the
 middle of a passage too narrow for its margins. So a plan always exists, and says what it lacks.
 

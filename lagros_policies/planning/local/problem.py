@@ -1,4 +1,4 @@
-"""The quadratic programs behind the plan of one agent, `local_plan`: steps, distances, passes."""
+"""The quadratic programs behind the plan of one agent: steps, distances, passes."""
 
 from __future__ import annotations
 

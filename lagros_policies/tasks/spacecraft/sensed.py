@@ -122,7 +122,7 @@ class WorldState(NamedTuple):
 
     @classmethod
     def of(cls, agents: int, obstacles: int, observation: NDArray[np.floating]) -> WorldState:
-        """Take global states apart; `observation.named_state_space` says how they are laid out.
+        """Take global states apart; `sensing.named_state_space` says how they are laid out.
 
         Args:
             agents: n, agents in a world.
