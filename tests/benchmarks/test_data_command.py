@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 import lagros_envs
 from lagros_benchmarks.commands import cli, data
+from lagros_benchmarks.run.demonstrations import DemonstrationSettings, demonstrate
 from lagros_envs.seeding import EVALUATION, episode_seeds
-from lagros_policies.learning.demonstrations import DemonstrationSettings, demonstrate
 from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
 
 minari = pytest.importorskip("minari")
@@ -52,7 +52,7 @@ def grounded(monkeypatch):
     def refuse(*arguments):
         raise AssertionError("the check must come before the flights")
 
-    monkeypatch.setattr("lagros_policies.learning.demonstrations.demonstrate", refuse)
+    monkeypatch.setattr("lagros_benchmarks.run.demonstrations.demonstrate", refuse)
 
 
 def test_minari_reads_back_what_the_environment_does_again(dataset):
