@@ -239,7 +239,7 @@ def test_what_killed_exports_left_is_removed(tmp_path):
     ("arguments", "message"),
     [
         ((), "name the format to write: pass --minari"),
-        (("--minari", "--task", "cartpol"), "task='cartpol' must be one of cartpole, spacecraft"),
+        (("--minari", "--task", "cartpol"), "unknown task 'cartpol'. Did you mean 'cartpole'?"),
         (("--minari", "--episodes", "0"), "episodes=0 must be a whole number"),
         (("--minari", "--seed", "-1"), "seed=-1 must be a non-negative integer"),
         (("--minari", "--disturbance", "worst"), "disturbance='worst' must be one of none,"),

@@ -29,10 +29,6 @@ if TYPE_CHECKING:
 
 # Where Minari looks for its datasets.
 DATASETS_PATH = "MINARI_DATASETS_PATH"
-_ALGORITHMS = {
-    True: "CV-STEM tube MPC: one plan, tracked with u*",
-    False: "centralised planner of one agent, tracked with u*",
-}
 
 data = typer.Typer(help="Expert data for other libraries.", no_args_is_help=True)
 
@@ -45,7 +41,10 @@ def main() -> None:
 @data.command(cls=Command)
 def export(
     minari: Annotated[bool, typer.Option("--minari", help="Write a Minari dataset.")] = False,
-    task: Annotated[str, typer.Option(help="As for `lagros bench`; one agent flies.")] = "cartpole",
+    task: Annotated[
+        str | None,
+        typer.Option(help="As for `lagros bench`, by default the first; of many agents one flies."),
+    ] = None,
     episodes: Annotated[int, typer.Option(help="Episodes.")] = 100,
     seed: Annotated[int, typer.Option(help="Seed; its episodes never occur in evaluation.")] = 0,
     disturbance: Annotated[
@@ -71,17 +70,18 @@ def export(
     except ImportError as error:
         fail(error, status=1)
     from lagros_benchmarks.run.demonstrations import DemonstrationSettings, demonstrate
-    from lagros_envs.registry import find_task
+    from lagros_envs.registry import find_task, task_names
 
     try:
         if disturbance == "none":
             refuse_options(["--bound"], "no disturbance has a bound")
-        described = find_task(task)
+        described = find_task(task or task_names()[0])
         settings = DemonstrationSettings(described.name, episodes, seed, disturbance, bound)
     except ValueError as error:
         fail(error)
     try:
-        check_free(out, dataset_id(described.name))
+        identifier = dataset_id(described.name)
+        check_free(out, identifier)
     except ValueError as error:
         fail(error)
     try:
@@ -93,7 +93,7 @@ def export(
     made: list[Written] = []
     # A full disk, a dataset that came in between: what was flown is kept elsewhere.
     delivery = Delivery()
-    place = out / dataset_id(described.name)
+    place = out / identifier
     delivery.write(
         place,
         lambda path: made.append(
@@ -103,7 +103,7 @@ def export(
     for written in made:
         typer.echo(summary(written, flown))
     delivery.tell(*(note(written, flown) for written in made))
-    typer.echo(f"read it with {DATASETS_PATH}={out} and minari.load_dataset('{dataset_id(described.name)}')")
+    typer.echo(f"read it with {DATASETS_PATH}={out} and minari.load_dataset('{identifier}')")
 
 
 def dataset_id(task: str) -> str:
@@ -226,6 +226,8 @@ def _create(
 ) -> None:
     from minari import create_dataset_from_buffers
 
+    from lagros_benchmarks.run.room import room_of
+
     package = metadata.metadata("lagros")
     with warnings.catch_warnings():
         # Neither exists: the package has no address, and its authors no common letter box.
@@ -235,7 +237,7 @@ def _create(
             [_buffer(index, episode) for index, episode in enumerate(flown)],
             env=env,
             eval_env=env.spec,
-            algorithm_name=_ALGORITHMS[settings.described.most_agents == 1],
+            algorithm_name=room_of(settings.described).part("demonstrations").algorithm,
             author=package["Author"],
             description=_description(settings),
             # With pyarrow, of the extra `data`; Minari's other format, HDF5, would need h5py.

@@ -11,7 +11,7 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import gymnasium as gym
 import numpy as np
@@ -127,7 +127,14 @@ class Demonstration:
 
 
 class Expert(BasePolicy):
-    """What flies the episodes: a policy that shows its plan."""
+    """What flies the episodes: a policy that shows its plan.
+
+    Attributes:
+        algorithm: What it is, for the data's record.
+    """
+
+    name = "expert"
+    algorithm: ClassVar[str] = ""
 
     def nominal(self, state: PolicyState) -> tuple[FloatArray, FloatArray]:
         """Return x_d (T + 1, n) and u_d (T + 1, k) up to the time limit, nan where unplanned."""
@@ -222,7 +229,7 @@ class SingleExpert(Expert):
         env: The environment, unwrapped.
     """
 
-    name = "expert"
+    algorithm = "CV-STEM tube MPC: one plan, tracked with u*"
 
     def __init__(self, env: Any) -> None:
         """Build the policy."""

@@ -23,7 +23,7 @@ class SpacecraftExpert(Expert):
         env: The environment, unwrapped.
     """
 
-    name = "expert"
+    algorithm = "centralised planner of one agent, tracked with u*"
 
     def __init__(self, env: Any) -> None:
         """Build the policy."""
