@@ -36,4 +36,5 @@ SHIPPED = {
         "lagros_envs.tasks.spacecraft.single:SpacecraftEnv",
         "lagros_envs.tasks.spacecraft.vector:SpacecraftVectorEnv",
     ),
+    "pvtol": Shipped("lagros_envs.tasks.pvtol.task:PvtolSettings", "Pvtol", 60),
 }

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.numbers import functions
+from lagros_envs.task import Task
+from lagros_policies.room import part_of
 
 Float32Array = NDArray[np.float32]
 
@@ -32,6 +34,29 @@ class Seen(NamedTuple):
     signs: Sequence[Any] = ()
 
 
+Vector = Sequence[Any]
+_SMALL = 1e-3  # lengths below are none [m, m/s]
+_MOTION = (
+    "distance of the goal [m]",
+    "ahead x",
+    "ahead y",
+    "motion x [m/s]",
+    "motion y [m/s]",
+    "speed [m/s]",
+    "motion ahead [m/s]",
+    "motion aside [m/s]",
+)
+_DISC = (
+    "x [m]",
+    "y [m]",
+    "place ahead [m]",
+    "place aside [m]",
+    "place along the motion [m]",
+    "place across it [m]",
+    "gap [m]",
+    "nearness",
+    "presence",
+)
 # (components of an observation, functions) -> features and signs.
 See = Callable[[Sequence[Any], Any], Seen]
 
@@ -56,6 +81,95 @@ def seen(see: See, observation: Float32Array) -> tuple[Float32Array, Float32Arra
     return _table(many.features, observation.shape[:-1]), (
         _table(many.signs, observation.shape[:-1]) if many.signs else None
     )
+
+
+def see_of(task: Task) -> See:
+    """Return what the networks of a task see: its own way of seeing, or the usual one."""
+    see: See = part_of(task, "SEE", "lagros_policies.learning.features:Usual")(task)
+    return see
+
+
+class Usual:
+    """What is seen of any task of one body: itself, its goal, and each disc alike.
+
+    Of the body: where the goal is, the other coordinates of state and goal, sine and cosine of
+    angles, how the position moves when the control rests, and the time that is left. Of a disc:
+    where it is, in the axes of the world, of the way to the goal and of the motion, and how far its
+    edge is from the body's; zeros where there is none.
+
+    Args:
+        task: The task; a coordinate whose unit is "[rad]" is an angle.
+
+    Attributes:
+        names: Of the features.
+        discs: Of how many discs the last features are, as many of each.
+    """
+
+    def __init__(self, task: Task) -> None:
+        """Look at the coordinates."""
+        n = task.system.state_dim
+        self.task, self.discs = task, task.most_discs if task.position else 0
+        names = task.state_names or tuple(f"x{index}" for index in range(n))
+        self._placed = task.position or tuple(range(n))
+        self._others = tuple(index for index in range(n) if index not in self._placed)
+        self._angles = tuple(index for index in range(n) if names[index].endswith("[rad]"))
+        self._reach = max(task.body_radius + task.margin, _SMALL)
+        self.names = (
+            *(f"{names[index]} of the goal from here" for index in self._placed),
+            *(names[index] for index in self._others),
+            *(f"{names[index]} of the goal" for index in self._others),
+            *(f"{part} {names[index]}" for index in self._angles for part in ("sin", "cos")),
+            "time left [s]",
+            *(_MOTION if task.position else ()),
+            *(f"{part} of disc {disc}" for disc in range(self.discs) for part in _DISC),
+        )
+
+    def __call__(self, observation: Sequence[Any], functions: Any) -> Seen:
+        """See an observation, given by its components."""
+        task, layout = self.task, self.task.layout
+        state, goal = observation[layout.state], observation[layout.goal]
+        features = [goal[index] - state[index] for index in self._placed]
+        features += [state[index] for index in self._others]
+        features += [goal[index] for index in self._others]
+        for index in self._angles:
+            features += [functions.sin(state[index]), functions.cos(state[index])]
+        features.append(task.time_limit - observation[layout.time])
+        if task.position:
+            rates = task.system.derivative(state, task.control_centre, functions)
+            way, motion = features[:2], [rates[index] for index in task.position]
+            (ahead, distance), (course, speed) = (_unit(one, functions) for one in (way, motion))
+            features += [distance, *ahead, *motion, speed, *_turned(motion, ahead)]
+            here = [state[index] for index in task.position]
+            discs = observation[layout.discs]
+            for place in range(0, 3 * self.discs, 3):
+                disc = discs[place : place + 3]
+                features += self._disc(disc, here, ahead, course, functions)
+        return Seen(features)
+
+    def _disc(
+        self, disc: Vector, here: Vector, ahead: Vector, course: Vector, functions: Any
+    ) -> list[Any]:
+        x, y, radius = disc
+        apart = x - here[0], y - here[1]
+        gap = functions.sqrt(apart[0] * apart[0] + apart[1] * apart[1]) - radius
+        gap = gap - self.task.body_radius
+        near = functions.exp(-gap / self._reach)
+        seen = *apart, *_turned(apart, ahead), *_turned(apart, course), gap, near, 1.0
+        there = radius > 0.0
+        return [functions.where(there, one, 0.0) for one in seen]
+
+
+def _unit(vector: Vector, functions: Any) -> tuple[Vector, Any]:
+    """Return a vector of the plane at length one, or less where it is almost zero; its length."""
+    x, y = vector
+    length = functions.sqrt(x * x + y * y + _SMALL * _SMALL)
+    return (x / length, y / length), length
+
+
+def _turned(vector: Vector, axis: Vector) -> Vector:
+    """Return a vector of the plane along an axis and across it."""
+    (x, y), (cosine, sine) = vector, axis
+    return x * cosine + y * sine, y * cosine - x * sine
 
 
 def _table(columns: Sequence[Any], shape: tuple[int, ...]) -> Float32Array:

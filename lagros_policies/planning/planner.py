@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lagros_envs.checks import shown
 from lagros_envs.task import Numbers, Scenario, Task
 from lagros_policies.planning.guess import PlannerSettings, plan_trajectory
-from lagros_policies.planning.problem import Discs, Problem
+from lagros_policies.planning.problem import DISTANCE_SLACK, Discs, Problem
 from lagros_policies.planning.scp import solve_scp
 from lagros_policies.planning.trajectory import Trajectory
 from lagros_policies.room import part_of
@@ -65,7 +65,7 @@ def problem_of(
     """Return what a task asks of a planner.
 
     Bounds, scales, discs and the reference control are those of the task. Where the start or the
-    goal is nearer to a disc than the task's margin, all margins shrink to what is there.
+    goal is nearer to a disc than the task's margin, the margin grows from what is there.
 
     Args:
         task: The task.
@@ -93,7 +93,7 @@ def problem_of(
         reference_control=_filled(task.control_centre, m, 0.0),
         state_scale=_filled(task.state_scale, n, 1.0),
         control_scale=_filled(task.control_spread, m, 1.0),
-        discs=_discs(task, scenario.discs, start, goal),
+        discs=_discs(task, scenario.discs, start, goal, steps_left(task, first_step)),
     )
 
 
@@ -162,11 +162,18 @@ def _filled(given: Numbers, count: int, none: float) -> FloatArray:
     return np.array(given if given else (none,) * count)
 
 
-def _discs(task: Task, discs: FloatArray, start: FloatArray, goal: FloatArray) -> Discs | None:
+def _discs(
+    task: Task, discs: FloatArray, start: FloatArray, goal: FloatArray, steps: int
+) -> Discs | None:
     if not len(discs) or not task.position:
         return None
     first, second = task.position
     ends = np.stack([start, goal])[:, None, [first, second]]
     room = np.linalg.norm(ends - discs[:, :2], axis=-1) - discs[:, 2] - task.body_radius
-    margin = min(task.margin, max(float(np.min(room)), 0.0))
-    return Discs(discs[:, :2], discs[:, 2], task.body_radius, np.array(margin), (first, second))
+    margin = np.array(task.margin)
+    least = np.maximum(np.min(room, axis=1) - DISTANCE_SLACK, 0.0)
+    if np.any(least < margin):
+        # From what there is at an end to the whole margin within a second, from rest.
+        grown = task.margin * (task.control_period * np.arange(steps + 1)) ** 2
+        margin = np.minimum(margin, np.minimum(least[0] + grown, least[1] + grown[::-1]))
+    return Discs(discs[:, :2], discs[:, 2], task.body_radius, margin, (first, second))

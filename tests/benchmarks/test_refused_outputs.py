@@ -25,7 +25,7 @@ WORK = (
     "lagros_benchmarks.commands.train._train_one",
     "lagros_benchmarks.commands.export._written",
     "lagros_benchmarks.report.playback.Playback.play",
-    "lagros_benchmarks.run.demonstrations.demonstrate",
+    "lagros_policies.learning.demonstrations.demonstrate",
 )
 START = {
     "bench": "bench spacecraft --policies learned --episodes 1",

@@ -88,12 +88,15 @@ def test_the_problem_of_a_task_is_its_own():
     np.testing.assert_allclose(problem.discs.required(15)[0], scenario.discs[:, 2] + 0.1 + 0.2)
 
 
-def test_margins_shrink_to_what_a_start_beside_a_disc_leaves():
+def test_margins_grow_from_what_a_start_beside_a_disc_leaves():
     task = Slide()
     start, goal = np.zeros(4), np.array([4.0, 0.0, 0.0, 0.0])
     discs = np.array([[0.6, 0.0, 0.4], [2.5, 1.0, 0.3]])  # 0.1 m beyond touching
     problem = problem_of(task, Scenario(start, goal, discs))
-    np.testing.assert_allclose(problem.discs.margin, 0.1)
+    margin = problem.discs.margin
+    np.testing.assert_allclose(margin[0], 0.1, atol=1e-5)
+    assert np.all(np.diff(margin) >= 0.0)
+    np.testing.assert_allclose(margin[10:], task.margin)
     assert planner_of(task).plan(start, goal, discs=discs).solved
     discs = discs - [0.15, 0.0, 0.0]
     with pytest.raises(ValueError, match=r"initial_state is 0\.45 from the centre of disc 0"):

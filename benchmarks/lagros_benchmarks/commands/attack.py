@@ -118,14 +118,13 @@ def _settings(
 ) -> AttackSettings:
     from lagros_benchmarks.worst_case.attack import AttackSettings, bench_of
     from lagros_benchmarks.worst_case.search import SearchSettings
-    from lagros_envs.registry import find_task
+    from lagros_envs.registry import task_named
 
     if method == "cma":
         check_extra("--method cma", "attack")
-    described = find_task(task)
-    defaults = described.defaults
+    defaults = task_named(task).defaults
     return AttackSettings(
-        task=described.name,
+        task=task,
         policy=policy,
         goal=goal,
         bound=defaults.bound if bound is None else bound,
@@ -134,7 +133,7 @@ def _settings(
         search=SearchSettings(
             method,
             budget=defaults.attack_budget if budget is None else budget,
-            population=bench_of(described.name).population,
+            population=bench_of(task).population,
         ),
     )
 
@@ -163,12 +162,12 @@ def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> No
 def _replay(task: str, policy: str, path: Path) -> None:
     from lagros_benchmarks.worst_case.attack import fly_again
     from lagros_benchmarks.worst_case.replay import load_worst_cases
-    from lagros_envs.registry import find_task
+    from lagros_envs.registry import task_named
 
-    described = find_task(task)
+    task_named(task)
     try:
         cases = load_worst_cases(path)
-        _check_command(cases.command, described.name, policy)
+        _check_command(cases.command, task, policy)
         flown = fly_again(cases)
     except FileNotFoundError as error:
         raise ValueError(f"--replay: {error}; --npz of an earlier attack writes one") from None

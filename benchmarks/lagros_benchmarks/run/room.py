@@ -28,7 +28,7 @@ class Room:
         certify: The certificate.
         reproduce: Everything from nothing.
         train: Training by reinforcement.
-        demonstrations: The expert whose episodes `lagros data` writes.
+        demonstrations: Expert episodes as data.
     """
 
     experiment: str = "lagros_benchmarks.run.single:SingleExperiment"
@@ -41,7 +41,7 @@ class Room:
     certify: str = "lagros_benchmarks.evidence.single:certify"
     reproduce: str = "lagros_benchmarks.run.reproduce:ReproduceSettings"
     train: str = "lagros_benchmarks.training.single:TRAINING"
-    demonstrations: str = "lagros_benchmarks.run.demonstrations:SingleExpert"
+    demonstrations: str = "lagros_benchmarks.run.demonstrations:Expert"
 
     def part(self, name: str) -> Any:
         """Import one of the parts by the name of its attribute."""

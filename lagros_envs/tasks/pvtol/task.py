@@ -1,0 +1,123 @@
+"""From hover to hover across a field of discs: the planar quadrotor's task."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.task import Defaults, Feedback, Learning, MetricDesign, Scenario, Task
+from lagros_envs.tasks.pvtol.physics import Pvtol
+
+FloatArray = NDArray[np.float64]
+
+_TILT = math.pi / 3.0  # of plans, and their largest dphi/dt [rad, rad/s]
+_HOVER = Pvtol().hover
+_DISC_RADIUS = 0.5  # [m]
+_PASSAGE = 0.15  # between two discs a body has twice as much room [m]
+
+
+@dataclass(frozen=True)
+class PvtolSettings(Task):
+    """Fly 6 m to the side in 6 s, past three to five discs, and hover at the goal.
+
+    Limits are those of C3M (Sun, Jha & Fan 2021). A success is a body without collision, upright,
+    that comes within 0.3 m of the goal.
+
+    Attributes:
+        system: The quadrotor.
+        control_period: Zero-order hold [s].
+        time_limit: Length of an episode and of a plan [s].
+    """
+
+    system: Pvtol = field(default_factory=Pvtol)
+    control_period: float = 0.1
+    time_limit: float = 6.0
+
+    name, title = "pvtol", "Pvtol"
+    state_names = ("p_x [m]", "p_z [m]", "phi [rad]", "v_x [m/s]", "v_z [m/s]", "dphi/dt [rad/s]")
+    control_names = ("right thrust [N]", "left thrust [N]")
+    rates = (3, 4, 5)
+    state_low = (-math.inf, -math.inf, -_TILT, -2.0, -1.0, -_TILT)
+    state_high = (math.inf, math.inf, _TILT, 2.0, 1.0, _TILT)
+    state_scale = (1.0, 1.0, 0.3, 1.0, 1.0, 0.5)
+    control_spread = (0.1, 0.1)
+    goal_radius = 0.3
+    position = (0, 1)
+    body_radius = 0.2
+    most_discs = 5
+    margin = 0.25
+    metric = MetricDesign(
+        low=(-20.0, -20.0, -_TILT, -2.0, -1.0, -_TILT),
+        high=(20.0, 20.0, _TILT, 2.0, 1.0, _TILT),
+        error=(0.5, 0.5, 0.3, 0.5, 0.5, 0.5),
+        control_low=(_HOVER - 1.0,) * 2,
+        control_high=(_HOVER + 1.0,) * 2,
+        basis=("1", "cos(x[2])", "sin(x[2])", "x[3]"),
+        scaling=(1.0, 1.0, 3.0, 1.0, 1.0, 1.0),
+    )
+    feedback = Feedback((10.0, 10.0, 1.0, 1.0, 1.0, 0.1), (1.0, 1.0))
+    learning = Learning(plans=2000, disturbance_bound=0.4, hidden=(128, 128, 128), rounds=4)
+    defaults = Defaults(bounds=(0.3,), bound=0.3)
+
+    @property
+    def control_centre(self) -> tuple[float, ...]:
+        """Thrusts that hold a hover [N]."""
+        return (self.system.hover,) * 2
+
+    @property
+    def control_scale(self) -> tuple[float, ...]:
+        """From a hover to the most [N]."""
+        return (self.system.hover,) * 2
+
+    @property
+    def control_low(self) -> tuple[float, ...]:
+        """Rotors pull one way only [N]."""
+        return (0.0, 0.0)
+
+    @property
+    def control_high(self) -> tuple[float, ...]:
+        """Twice what a hover needs [N]."""
+        return (2.0 * self.system.hover,) * 2
+
+    def sample(self, rng: np.random.Generator) -> Scenario:
+        """Draw a start at the left, a goal at the right, and discs between with open passages."""
+        start, goal = np.zeros(6), np.zeros(6)
+        start[1], goal[:2] = rng.uniform(-1.5, 1.5), (6.0, rng.uniform(-1.5, 1.5))
+        keep = _DISC_RADIUS + self.body_radius + _PASSAGE
+        ends = np.stack([start[:2], goal[:2]])
+        while True:
+            count = int(rng.integers(3, self.most_discs + 1))
+            across, aside = rng.uniform(1.2, 4.8, count), rng.uniform(-1.5, 1.5, count)
+            centres = np.stack([across, aside], axis=-1)
+            apart = np.linalg.norm(centres[:, None] - centres, axis=-1) + 1e9 * np.eye(count)
+            gaps = np.linalg.norm(centres[:, None] - ends, axis=-1)
+            if np.all(apart >= 2.0 * keep) and np.all(gaps >= keep + 0.1):
+                discs = np.concatenate([centres, np.full((count, 1), _DISC_RADIUS)], axis=-1)
+                return Scenario(start, goal, discs)
+
+    def excess(self, state: Sequence[Any], functions: Any) -> Any:
+        """Return by how much the body tilts beyond a right angle [rad]."""
+        return abs(state[2]) - math.pi / 2.0
+
+    def outline(self, state: FloatArray) -> Sequence[FloatArray]:
+        """Return the rod and the two rotors."""
+        place, roll = state[:2], state[2]
+        along = np.array([math.cos(roll), math.sin(roll)])
+        across = np.array([-along[1], along[0]])
+        arm, thin, blade = self.system.arm, 0.02, 0.09
+        parts = [(-arm, arm, -thin, thin)]
+        parts += [(end - blade, end + blade, 0.04, 0.06) for end in (-arm, arm)]
+        return [
+            np.stack(
+                [
+                    place + x * along + y * across
+                    for x, y in ((left, low), (right, low), (right, high), (left, high))
+                ]
+            )
+            for left, right, low, high in parts
+        ]
