@@ -29,7 +29,7 @@ def imported(path: Path) -> ModuleType:
     """
     path = path.expanduser().resolve()
     if not path.is_file():
-        raise ValueError(f"there is no file {shown(str(path))}")
+        raise ValueError(f"task={shown(str(path))}: there is no such file")
     readable = re.sub(r"\W", "_", path.stem)
     name = f"{__name__}.{readable}_{str(path).encode().hex()}"
     changed = path.stat().st_mtime_ns

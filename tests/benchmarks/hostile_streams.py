@@ -21,13 +21,12 @@ from typing import Any
 import lagros_benchmarks.__main__ as program
 from lagros_benchmarks.commands import cli
 from lagros_benchmarks.report import figures
-from lagros_benchmarks.run import files, runner
+from lagros_benchmarks.run import demonstrations, files, runner
 from lagros_benchmarks.tasks.spacecraft import certify as spacecraft_certify
 from lagros_benchmarks.tasks.spacecraft import scene_figure
 from lagros_benchmarks.training import curves
 from lagros_benchmarks.training import settings as training_settings
 from lagros_benchmarks.worst_case import attack
-from lagros_policies.learning import demonstrations
 from tests.benchmarks.tiny_training import TINY
 
 BENCH = "--json b.json --csv b.csv --latex b.tex --markdown b.md --figure b.png"

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 import lagros_envs
 from lagros_benchmarks.commands import cli, data
+from lagros_benchmarks.run.demonstrations import DemonstrationSettings, demonstrate
 from lagros_envs.seeding import EVALUATION, episode_seeds
-from lagros_policies.learning.demonstrations import DemonstrationSettings, demonstrate
 from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
 
 minari = pytest.importorskip("minari")
@@ -52,7 +52,7 @@ def grounded(monkeypatch):
     def refuse(*arguments):
         raise AssertionError("the check must come before the flights")
 
-    monkeypatch.setattr("lagros_policies.learning.demonstrations.demonstrate", refuse)
+    monkeypatch.setattr("lagros_benchmarks.run.demonstrations.demonstrate", refuse)
 
 
 def test_minari_reads_back_what_the_environment_does_again(dataset):
@@ -239,7 +239,7 @@ def test_what_killed_exports_left_is_removed(tmp_path):
     ("arguments", "message"),
     [
         ((), "name the format to write: pass --minari"),
-        (("--minari", "--task", "cartpol"), "task='cartpol' must be one of cartpole, spacecraft"),
+        (("--minari", "--task", "cartpol"), "unknown task 'cartpol'. Did you mean 'cartpole'?"),
         (("--minari", "--episodes", "0"), "episodes=0 must be a whole number"),
         (("--minari", "--seed", "-1"), "seed=-1 must be a non-negative integer"),
         (("--minari", "--disturbance", "worst"), "disturbance='worst' must be one of none,"),

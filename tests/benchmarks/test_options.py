@@ -271,7 +271,7 @@ def invoke(tmp_path, monkeypatch):
         "commands.export._written",
     ):
         monkeypatch.setattr(f"lagros_benchmarks.{place}", begin)
-    monkeypatch.setattr("lagros_policies.learning.demonstrations.demonstrate", begin)
+    monkeypatch.setattr("lagros_benchmarks.run.demonstrations.demonstrate", begin)
     monkeypatch.setenv("COLUMNS", "500")
     # Building the commands takes nine tenths of a call that refuses.
     monkeypatch.setattr("typer.testing._get_command", lambda _: COMMAND)

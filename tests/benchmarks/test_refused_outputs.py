@@ -25,7 +25,7 @@ WORK = (
     "lagros_benchmarks.commands.train._train_one",
     "lagros_benchmarks.commands.export._written",
     "lagros_benchmarks.report.playback.Playback.play",
-    "lagros_policies.learning.demonstrations.demonstrate",
+    "lagros_benchmarks.run.demonstrations.demonstrate",
 )
 START = {
     "bench": "bench spacecraft --policies learned --episodes 1",

@@ -118,13 +118,14 @@ def _settings(
 ) -> AttackSettings:
     from lagros_benchmarks.worst_case.attack import AttackSettings, bench_of
     from lagros_benchmarks.worst_case.search import SearchSettings
-    from lagros_envs.registry import task_named
+    from lagros_envs.registry import find_task
 
     if method == "cma":
         check_extra("--method cma", "attack")
-    defaults = task_named(task).defaults
+    described = find_task(task)
+    defaults = described.defaults
     return AttackSettings(
-        task=task,
+        task=described.name,
         policy=policy,
         goal=goal,
         bound=defaults.bound if bound is None else bound,
@@ -133,7 +134,7 @@ def _settings(
         search=SearchSettings(
             method,
             budget=defaults.attack_budget if budget is None else budget,
-            population=bench_of(task).population,
+            population=bench_of(described.name).population,
         ),
     )
 
@@ -162,12 +163,12 @@ def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> No
 def _replay(task: str, policy: str, path: Path) -> None:
     from lagros_benchmarks.worst_case.attack import fly_again
     from lagros_benchmarks.worst_case.replay import load_worst_cases
-    from lagros_envs.registry import task_named
+    from lagros_envs.registry import find_task
 
-    task_named(task)
+    described = find_task(task)
     try:
         cases = load_worst_cases(path)
-        _check_command(cases.command, task, policy)
+        _check_command(cases.command, described.name, policy)
         flown = fly_again(cases)
     except FileNotFoundError as error:
         raise ValueError(f"--replay: {error}; --npz of an earlier attack writes one") from None

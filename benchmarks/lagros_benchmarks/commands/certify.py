@@ -58,10 +58,10 @@ def certify(
     from lagros_benchmarks.run.room import room_of
     from lagros_envs.checks import check_disturbance_bound, check_positive, check_whole, shown
     from lagros_envs.reading import check_file
-    from lagros_envs.registry import task_named
+    from lagros_envs.registry import find_task
 
     try:
-        described = task_named(task)
+        described = find_task(task)
         defaults = described.defaults
         asked = defaults.certify_policies[0] if policy is None else policy
         if asked not in defaults.certify_policies:

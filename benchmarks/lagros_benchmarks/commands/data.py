@@ -25,14 +25,10 @@ from lagros_benchmarks.commands.terminal import Command, fail, progress_bar, ref
 if TYPE_CHECKING:
     import gymnasium as gym
 
-    from lagros_policies.learning.demonstrations import Demonstration, DemonstrationSettings
+    from lagros_benchmarks.run.demonstrations import Demonstration, DemonstrationSettings
 
 # Where Minari looks for its datasets.
 DATASETS_PATH = "MINARI_DATASETS_PATH"
-_ALGORITHMS = {
-    "cartpole": "CV-STEM tube MPC: one plan, tracked with u*",
-    "spacecraft": "centralised planner of one agent, tracked with u*",
-}
 
 data = typer.Typer(help="Expert data for other libraries.", no_args_is_help=True)
 
@@ -45,7 +41,10 @@ def main() -> None:
 @data.command(cls=Command)
 def export(
     minari: Annotated[bool, typer.Option("--minari", help="Write a Minari dataset.")] = False,
-    task: Annotated[str, typer.Option(help="cartpole, or spacecraft (one agent).")] = "cartpole",
+    task: Annotated[
+        str | None,
+        typer.Option(help="As for `lagros bench`, by default the first; of many agents one flies."),
+    ] = None,
     episodes: Annotated[int, typer.Option(help="Episodes.")] = 100,
     seed: Annotated[int, typer.Option(help="Seed; its episodes never occur in evaluation.")] = 0,
     disturbance: Annotated[
@@ -54,8 +53,8 @@ def export(
     bound: Annotated[
         float | None,
         typer.Option(
-            help="Bound d̄ of the disturbance, in units of the state per second. "
-            "(default: 0.75 for cartpole, 0.4 for spacecraft)"
+            help="Bound d̄ of the disturbance, in units of the state per second; the task's own "
+            "if not given."
         ),
     ] = None,
     out: Annotated[
@@ -70,16 +69,19 @@ def export(
         check_extra("--minari", "data")
     except ImportError as error:
         fail(error, status=1)
-    from lagros_policies.learning.demonstrations import DemonstrationSettings, demonstrate
+    from lagros_benchmarks.run.demonstrations import DemonstrationSettings, demonstrate
+    from lagros_envs.registry import find_task, task_names
 
     try:
         if disturbance == "none":
             refuse_options(["--bound"], "no disturbance has a bound")
-        settings = DemonstrationSettings(task, episodes, seed, disturbance, bound)
+        described = find_task(task or task_names()[0])
+        settings = DemonstrationSettings(described.name, episodes, seed, disturbance, bound)
     except ValueError as error:
         fail(error)
     try:
-        check_free(out, dataset_id(task))
+        identifier = dataset_id(described.name)
+        check_free(out, identifier)
     except ValueError as error:
         fail(error)
     try:
@@ -91,7 +93,7 @@ def export(
     made: list[Written] = []
     # A full disk, a dataset that came in between: what was flown is kept elsewhere.
     delivery = Delivery()
-    place = out / dataset_id(task)
+    place = out / identifier
     delivery.write(
         place,
         lambda path: made.append(
@@ -101,7 +103,7 @@ def export(
     for written in made:
         typer.echo(summary(written, flown))
     delivery.tell(*(note(written, flown) for written in made))
-    typer.echo(f"read it with {DATASETS_PATH}={out} and minari.load_dataset('{dataset_id(task)}')")
+    typer.echo(f"read it with {DATASETS_PATH}={out} and minari.load_dataset('{identifier}')")
 
 
 def dataset_id(task: str) -> str:
@@ -224,6 +226,8 @@ def _create(
 ) -> None:
     from minari import create_dataset_from_buffers
 
+    from lagros_benchmarks.run.room import room_of
+
     package = metadata.metadata("lagros")
     with warnings.catch_warnings():
         # Neither exists: the package has no address, and its authors no common letter box.
@@ -233,7 +237,7 @@ def _create(
             [_buffer(index, episode) for index, episode in enumerate(flown)],
             env=env,
             eval_env=env.spec,
-            algorithm_name=_ALGORITHMS[settings.task],
+            algorithm_name=room_of(settings.described).part("demonstrations").algorithm,
             author=package["Author"],
             description=_description(settings),
             # With pyarrow, of the extra `data`; Minari's other format, HDF5, would need h5py.
@@ -301,10 +305,8 @@ def _record(flown: Sequence[Demonstration], record: dict[str, Any], outside: int
 
 
 def _description(settings: DemonstrationSettings) -> str:
-    from lagros_policies.learning.demonstrations import ENVIRONMENTS
-
     return (
-        f"Episodes of the expert in {ENVIRONMENTS[settings.task]} under the disturbance "
+        f"Episodes of the expert in {settings.described.env_id} under the disturbance "
         f"{settings.disturbance!r} of bound {settings.disturbance_bound:g}. The expert plans once, "
         "from the start to the goal, and tracks the plan with u*. The infos hold the plan "
         "(nominal_state x_d, nominal_control u_d). Actions beyond the action space, if there are "

@@ -75,13 +75,14 @@ def watch(
     from lagros_benchmarks.run.flying import RAISED
     from lagros_benchmarks.run.library import SetupError
     from lagros_envs.files import write_atomic
+    from lagros_envs.registry import find_task
 
     find_users_modules([policy])
     try:
         if disturbance == "none":
             refuse_options(["--bound"], "no disturbance has a bound")
         settings = WatchSettings(
-            task=task,
+            task=find_task(task).name,
             policy=policy,
             agents=agents,
             preset=preset,

@@ -23,7 +23,7 @@ from lagros_envs.checks import (
     check_whole,
 )
 from lagros_envs.disturbances import KINDS
-from lagros_envs.registry import task_named
+from lagros_envs.registry import find_task
 from lagros_envs.task import Described
 
 # Slower films would have pictures without end, faster ones none.
@@ -105,7 +105,7 @@ class WatchSettings:
     @property
     def described(self) -> Described:
         """The task."""
-        return task_named(self.task)
+        return find_task(self.task)
 
     @property
     def disturbance_bound(self) -> float:

@@ -28,7 +28,7 @@ class Room:
         certify: The certificate.
         reproduce: Everything from nothing.
         train: Training by reinforcement.
-        demonstrations: Expert episodes as data.
+        demonstrations: The expert whose episodes `lagros data` writes.
     """
 
     experiment: str = "lagros_benchmarks.run.single:SingleExperiment"
@@ -41,7 +41,7 @@ class Room:
     certify: str = "lagros_benchmarks.evidence.single:certify"
     reproduce: str = "lagros_benchmarks.run.reproduce:ReproduceSettings"
     train: str = "lagros_benchmarks.training.single:TRAINING"
-    demonstrations: str = "lagros_benchmarks.run.demonstrations:Expert"
+    demonstrations: str = "lagros_benchmarks.run.demonstrations:SingleExpert"
 
     def part(self, name: str) -> Any:
         """Import one of the parts by the name of its attribute."""

@@ -26,7 +26,7 @@ from lagros_envs.checks import (
     check_whole,
 )
 from lagros_envs.reading import Record
-from lagros_envs.registry import task_named
+from lagros_envs.registry import find_task
 from lagros_envs.seeding import episode_seeds
 
 FloatArray = NDArray[np.float64]
@@ -130,7 +130,7 @@ class Attack:
 
 def bench_of(task: str) -> Any:
     """Return the class of a task's `Bench`."""
-    return room_of(task_named(task)).part("attack")
+    return room_of(find_task(task)).part("attack")
 
 
 def run_attack(settings: AttackSettings, progress: Progress | None = None) -> Attack:

@@ -35,7 +35,7 @@ from lagros_benchmarks.worst_case.replay import Outcome
 from lagros_benchmarks.worst_case.search import Found, search
 from lagros_benchmarks.worst_case.sequences import Replay
 from lagros_envs.disturbances import onto_unit_sphere
-from lagros_envs.registry import task_named
+from lagros_envs.registry import find_task
 from lagros_envs.task import LARGEST_DISTANCE, Task
 from lagros_policies.contraction import ContractionMetric
 from lagros_policies.tube_mpc import TubeMpcPolicy
@@ -167,7 +167,7 @@ class SingleBench:
     def __init__(self, settings: Any) -> None:
         """Find the task."""
         self.settings = settings
-        self.task = cast(Task, task_named(settings.task))
+        self.task = cast(Task, find_task(settings.task))
         self.shape = (self.task.steps, self.task.system.state_dim)
 
     @staticmethod

@@ -14,19 +14,19 @@ import pytest
 
 import lagros_envs
 import lagros_policies
-from lagros_envs.dynamics import hold_step
-from lagros_envs.seeding import EVALUATION, episode_seeds
-from lagros_envs.tasks.cartpole import task
-from lagros_policies.learning.demonstrations import (
+from lagros_benchmarks.run.demonstrations import (
     DemonstrationSettings,
     demonstrate,
     fly,
     make_expert,
 )
+from lagros_envs.dynamics import hold_step
+from lagros_envs.seeding import EVALUATION, episode_seeds
+from lagros_envs.tasks.cartpole import task
 from lagros_policies.tasks.cartpole.planner import CartPolePlanner
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
-SETTINGS = DemonstrationSettings(episodes=2, seed=4, disturbance="gust", bound=0.5)
+SETTINGS = DemonstrationSettings("cartpole", episodes=2, seed=4, disturbance="gust", bound=0.5)
 CARTPOLE = task.CartPoleSettings()
 
 
@@ -93,7 +93,7 @@ def test_a_run_depends_on_its_seed_alone_and_begins_with_a_shorter_one(flown):
 
 def test_seeds_are_those_of_training_and_never_of_an_evaluation():
     for seed in range(5):
-        seeds = DemonstrationSettings(episodes=500, seed=seed).seeds()
+        seeds = DemonstrationSettings("cartpole", episodes=500, seed=seed).seeds()
         assert seeds == episode_seeds(seed, 500)
         assert len(set(seeds)) == 500
         for other in range(20):
@@ -142,7 +142,9 @@ def test_a_failed_plan_is_counted_and_shown_as_missing(monkeypatch):
 
 
 def test_an_episode_that_ends_early_is_kept_as_it_was():
-    rough = DemonstrationSettings(episodes=1, seed=1, disturbance="constant", bound=30.0)
+    rough = DemonstrationSettings(
+        "cartpole", episodes=1, seed=1, disturbance="constant", bound=30.0
+    )
     (episode,), _ = demonstrate(rough)
     steps = len(episode.rewards)
     assert steps < 90
@@ -174,7 +176,7 @@ def test_the_record_says_which_metric_and_planner(run):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"task": "cartpol"}, "task='cartpol' must be one of cartpole, spacecraft"),
+        ({"task": "cartpol"}, "unknown task 'cartpol'. Did you mean 'cartpole'?"),
         ({"episodes": 0}, "episodes=0 must be a whole number"),
         ({"seed": -1}, "seed=-1 must be a non-negative integer"),
         ({"disturbance": "worst"}, "disturbance='worst' must be one of none, uniform"),
@@ -184,7 +186,7 @@ def test_the_record_says_which_metric_and_planner(run):
 )
 def test_a_wrong_setting_is_named_with_the_remedy(wrong, message):
     with pytest.raises(ValueError, match=message):
-        DemonstrationSettings(**wrong)
+        DemonstrationSettings(**{"task": "cartpole", **wrong})
 
 
 @pytest.mark.slow

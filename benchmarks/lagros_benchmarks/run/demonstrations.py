@@ -1,9 +1,8 @@
 """Expert demonstrations: whole episodes in the environment, as offline learners read them.
 
-The cart-pole's expert is the one behind policy (b): one plan, tracked with u*. A re-plan on the way
+The expert of one body is the one behind policy (b): one plan, tracked with u*. A re-plan on the way
 would confirm the plan (`tube_mpc`), so it is made once, and however long it takes: the data depend
-on settings and seed, never on the load of the machine. The expert of the spacecraft is policy (d)
-with one agent.
+on settings and seed, never on the load of the machine.
 """
 
 from __future__ import annotations
@@ -12,33 +11,27 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol, cast
+from typing import Any, ClassVar, cast
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import (
-    check_disturbance_bound,
-    check_fields,
-    check_name,
-    check_seed,
-    check_whole,
-)
+from lagros_benchmarks.run.closed_loop import ClosedLoop
+from lagros_benchmarks.run.room import room_of
+from lagros_envs.checks import check_disturbance_bound, check_fields, check_seed, check_whole
 from lagros_envs.disturbances import OPEN_LOOP
+from lagros_envs.registry import find_task
 from lagros_envs.seeding import episode_seeds
-from lagros_envs.tasks.spacecraft.sensing import global_state
-from lagros_policies.policy import PolicyState
+from lagros_envs.task import Described
+from lagros_policies.policy import BasePolicy, PolicyState
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 Environment = gym.Env[Any, Any]
 
-# Identifier of the environment of each task, and the bound of its disturbance if none is given.
-ENVIRONMENTS = {"cartpole": "lagros/CartPole-v0", "spacecraft": "lagros/Spacecraft-v0"}
 MOST_EPISODES = 1_000_000  # all lie in memory
-DEFAULT_BOUNDS = {"cartpole": 0.75, "spacecraft": 0.4}
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,18 +39,18 @@ class DemonstrationSettings:
     """What to fly.
 
     Attributes:
-        task: "cartpole" or "spacecraft".
+        task: As for `lagros bench`.
         episodes: Number of episodes.
         seed: Seed of the run. Its episodes belong to the namespace of training, so they are never
             those of an evaluation, of whatever seed.
         disturbance: An open-loop kind of `lagros_envs.disturbances`.
-        bound: d_bar, in units of the state per second; None for the task's own (0.75, 0.4).
+        bound: d_bar, in units of the state per second; None for the task's own.
 
     Raises:
         ValueError: A value is not valid.
     """
 
-    task: str = "cartpole"
+    task: str
     episodes: int = 100
     seed: int = 0
     disturbance: str = "uniform"
@@ -66,7 +59,7 @@ class DemonstrationSettings:
     def __post_init__(self) -> None:
         """Check the values."""
         check_fields(self)
-        check_name("task", self.task, ENVIRONMENTS)
+        find_task(self.task)
         check_whole("episodes", self.episodes, 1, MOST_EPISODES)
         check_seed(self.seed)
         if self.disturbance not in OPEN_LOOP:
@@ -78,11 +71,16 @@ class DemonstrationSettings:
             check_disturbance_bound("bound", self.bound, "or None for the task's own")
 
     @property
+    def described(self) -> Described:
+        """The task."""
+        return find_task(self.task)
+
+    @property
     def disturbance_bound(self) -> float:
         """The bound d_bar in force; 0 without disturbance."""
         if self.disturbance == "none":
             return 0.0
-        return DEFAULT_BOUNDS[self.task] if self.bound is None else self.bound
+        return self.described.defaults.bound if self.bound is None else self.bound
 
     def seeds(self) -> list[int]:
         """Return the seeds of the episodes, as given to `env.reset(seed=...)`."""
@@ -91,7 +89,7 @@ class DemonstrationSettings:
     def make_env(self) -> Environment:
         """Return the environment in which the expert flies."""
         return gym.make(
-            ENVIRONMENTS[self.task],
+            self.described.env_id,
             disturbance=self.disturbance,
             disturbance_bound=self.disturbance_bound,
         )
@@ -109,8 +107,7 @@ class Demonstration:
         terminations: Whether the step ended the episode early, shape (N,).
         truncations: Whether the step reached the time limit, shape (N,).
         infos: The environment's `info` at every instant, and the plan: `nominal_state` x_d and
-            `nominal_control` u_d (force [N], or acceleration [m/s^2, m/s^2, rad/s^2]), nan where
-            there is none. Each of shape (N + 1,) or (N + 1, k).
+            `nominal_control` u_d, nan where there is none. Each of shape (N + 1,) or (N + 1, k).
         counters: Plans that the expert asked for, and how many of them failed.
     """
 
@@ -129,27 +126,29 @@ class Demonstration:
         return bool(self.infos["success"][-1])
 
 
-class Expert(Protocol):
-    """What a task's expert does in one episode."""
+class Expert(BasePolicy):
+    """What flies the episodes: a policy that shows its plan.
 
-    def act(
-        self, env: Environment, observation: Float32Array, state: PolicyState
-    ) -> tuple[Float32Array, PolicyState]:
-        """Return the action and what to remember; the state is None at the start."""
+    Attributes:
+        algorithm: What it is, for the data's record.
+    """
+
+    name = "expert"
+    algorithm: ClassVar[str] = ""
 
     def nominal(self, state: PolicyState) -> tuple[FloatArray, FloatArray]:
         """Return x_d (T + 1, n) and u_d (T + 1, k) up to the time limit, nan where unplanned."""
-
-    def counters(self, state: PolicyState) -> dict[str, int]:
-        """Return how many plans were made and failed."""
+        raise NotImplementedError
 
     def record(self) -> dict[str, Any]:
         """Return metric, planner and feedback, in plain values."""
+        raise NotImplementedError
 
 
 def make_expert(settings: DemonstrationSettings, env: Environment) -> Expert:
     """Return the expert of a task, for the environment in which it flies."""
-    return _EXPERTS[settings.task](env.unwrapped)
+    made: Expert = room_of(settings.described).part("demonstrations")(env.unwrapped)
+    return made
 
 
 def fly(env: Environment, expert: Expert, seed: int) -> Demonstration:
@@ -163,21 +162,19 @@ def fly(env: Environment, expert: Expert, seed: int) -> Demonstration:
     Returns:
         What happened.
     """
-    observation, info = env.reset(seed=seed)
-    observations, infos = [observation], [info]
+    loop = ClosedLoop(env, expert)
+    observations: list[Float32Array] = []
+    infos: list[dict[str, Any]] = []
     actions: list[Float32Array] = []
     steps: list[tuple[float, bool, bool]] = []
-    state: PolicyState = None
-    terminated = truncated = False
-    while not (terminated or truncated):
-        action, state = expert.act(env, observation, state)
-        observation, reward, terminated, truncated, info = env.step(action)
-        observations.append(observation)
-        infos.append(info)
-        actions.append(action)
-        steps.append((float(reward), terminated, truncated))
+    for _ in loop.fly(seed):
+        observations.append(loop.observation)
+        infos.append(loop.info)
+        if loop.step:
+            actions.append(loop.action)
+            steps.append((float(loop.reward), loop.terminated, loop.truncated))
     kept = {name: np.array([info[name] for info in infos]) for name in infos[0]}
-    states, controls = expert.nominal(state)
+    states, controls = expert.nominal(loop.memory)
     kept["nominal_state"] = states[: len(infos)]
     kept["nominal_control"] = controls[: len(infos)]
     rewards, terminations, truncations = zip(*steps, strict=True)
@@ -189,7 +186,7 @@ def fly(env: Environment, expert: Expert, seed: int) -> Demonstration:
         terminations=np.array(terminations, np.bool_),
         truncations=np.array(truncations, np.bool_),
         infos=kept,
-        counters=expert.counters(state),
+        counters=loop.counters(),
     )
 
 
@@ -225,41 +222,50 @@ def demonstrate(
     return flown, record
 
 
-class _CartPoleExpert:
-    """One plan of the whole episode, tracked with u*."""
+class SingleExpert(Expert):
+    """One plan of the whole episode, tracked with u*.
+
+    Args:
+        env: The environment, unwrapped.
+    """
+
+    algorithm = "CV-STEM tube MPC: one plan, tracked with u*"
 
     def __init__(self, env: Any) -> None:
-        from lagros_policies.contraction import load_metric
+        """Build the policy."""
         from lagros_policies.tube_mpc import TubeMpcPolicy
 
         self._task = env.settings
-        self._metric = load_metric()
         # A failed plan is asked for again at the next step, as policy (b) does.
-        self._policy = TubeMpcPolicy(
-            env.settings, self._metric, replan_every=self._task.steps, deadline=math.inf
-        )
+        self._policy = TubeMpcPolicy(env.settings, replan_every=self._task.steps, deadline=math.inf)
 
-    def act(
-        self, env: Environment, observation: Float32Array, state: PolicyState
+    def predict(
+        self, observation: Float32Array, state: PolicyState = None, *rest: Any
     ) -> tuple[Float32Array, PolicyState]:
+        """Return the action, and the plan as the state."""
         return self._policy.predict(observation, state)
 
     def nominal(self, state: PolicyState) -> tuple[FloatArray, FloatArray]:
-        plan, steps = state[0].plan, self._task.steps
-        states, controls = np.full((steps + 1, 4), np.nan), np.full((steps + 1, 1), np.nan)
+        """Return x_d and u_d; see `Expert`."""
+        plan, system, steps = state[0].plan, self._task.system, self._task.steps
+        states = np.full((steps + 1, system.state_dim), np.nan)
+        controls = np.full((steps + 1, system.control_dim), np.nan)
         if plan is not None:
             states[steps - plan.horizon :] = plan.states
             controls[steps - plan.horizon : steps] = plan.controls
         return states, controls
 
     def counters(self, state: PolicyState) -> dict[str, int]:
+        """Return how many plans were made and failed."""
         counted = self._policy.counters(state)
         return {name: counted[name] for name in ("plans", "failed_plans")}
 
     def record(self) -> dict[str, Any]:
+        """Return metric, planner and feedback; see `Expert`."""
         from lagros_policies.contraction.metric_files import region_record
 
-        expert, metric = self._policy.expert, self._metric
+        expert = self._policy.expert
+        metric: Any = expert.metric
         check = metric.verification
         return {
             "metric": {
@@ -274,50 +280,3 @@ class _CartPoleExpert:
             "planner": asdict(expert.planner.settings),
             "feedback": asdict(expert.feedback),
         }
-
-
-class _SpacecraftExpert:
-    """One plan of the whole episode among the obstacles, tracked with u*."""
-
-    def __init__(self, env: Any) -> None:
-        from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
-
-        self._task = env.settings
-        self._policy = CentralizedPolicy(
-            env.settings, env.preset, 1, disturbance_bound=env.disturbance.bound
-        )
-
-    def act(
-        self, env: Environment, observation: Float32Array, state: PolicyState
-    ) -> tuple[Float32Array, PolicyState]:
-        # The planner knows all obstacles, also those that are not in sight yet.
-        world = cast(Any, env.unwrapped).episode.world
-        actions, state = self._policy.predict(global_state(world)[0], state)
-        return actions[0], state
-
-    def nominal(self, state: PolicyState) -> tuple[FloatArray, FloatArray]:
-        memory = state[0]
-        states, controls = memory.nominal[:, 0].copy(), memory.accelerations[:, 0]
-        controls = np.concatenate([controls, np.full((1, 3), np.nan)])
-        if not memory.solved:
-            states[:], controls[:] = np.nan, np.nan
-        return states, controls
-
-    def counters(self, state: PolicyState) -> dict[str, int]:
-        return self._policy.counters(state)
-
-    def record(self) -> dict[str, Any]:
-        tracking = self._policy.tracking
-        return {
-            "metric": {
-                name: {"alpha": axis.rate, "chi": axis.state_condition, "dual": axis.dual.tolist()}
-                for name, axis in (("plane", tracking.plane), ("turning", tracking.turning))
-            },
-            "planner": asdict(self._policy.planner.settings),
-        }
-
-
-_EXPERTS: dict[str, Callable[[Any], Expert]] = {
-    "cartpole": _CartPoleExpert,
-    "spacecraft": _SpacecraftExpert,
-}
