@@ -1,6 +1,6 @@
 """Actors that reinforcement learning has trained, as plain arrays, and the policies that run them.
 
-They run in NumPy: neither torch nor a pickle is loaded. `lagros train cartpole` writes them.
+They run in NumPy: neither torch nor a pickle is loaded. `lagros train` writes them.
 """
 
 from __future__ import annotations
@@ -14,58 +14,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_positive, shown
-from lagros_envs.conventions import settings_of
-from lagros_envs.tasks.cartpole import task
-from lagros_envs.tasks.cartpole.physics import ANGLE, POSITION
+from lagros_envs.task import Numbers, Task
 from lagros_policies.learning.networks import Mlp, read_safetensors, write_safetensors
-from lagros_policies.observed import cartpole_rows
+from lagros_policies.observed import observed_rows
 from lagros_policies.policy import BasePolicy
-from lagros_policies.trained_for import (
-    KEYS,
-    EpisodeRange,
-    cartpole_range,
-    check_trained_for,
-    range_of,
-)
+from lagros_policies.room import found_file, task_of
+from lagros_policies.trained_for import KEYS, check_weights
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 Squash = Literal["clip", "tanh"]
 
-PRETRAINED = Path(__file__).parent / "pretrained"
 SQUASHES: tuple[Squash, ...] = ("clip", "tanh")
 
-# Where the observation says what its episode asks for.
-_GOAL, _START = task.GOAL.start + POSITION, task.INITIAL_STATE.start + POSITION
-_LEAN = task.INITIAL_STATE.start + ANGLE
 _FORMAT = "lagros-actor-1"
 # Of files that are older than the choice of a squash: their actors clip.
 _CLIPPED_FORMAT = "lagros-ppo-actor-1"
+# Of the first task, whose control is a force.
+_SCALE = "force_scale"
 
 
-def goal_frame() -> FloatArray:
-    """Return F (4, 13): [p - p_f, theta, dp/dt, dtheta/dt] = F o, what the actors see."""
-    matrix = np.zeros((task.STATE_DIM, task.OBSERVATION_DIM))
-    matrix[:, task.STATE] = np.eye(task.STATE_DIM)
-    matrix[0, task.GOAL.start] = -1.0
+def goal_frame(task: Task) -> FloatArray:
+    """Return F (k, o), what the actors of a task see: F o, of an observation o.
+
+    It is the state, as its difference from the goal in those coordinates in which goals differ, and
+    each disc from the position, with its radius.
+    """
+    n, layout = task.system.state_dim, task.layout
+    matrix = np.zeros((n + 3 * task.most_discs, layout.size))
+    matrix[:n, layout.state] = np.eye(n)
+    for index in task.short_goal or range(n):
+        matrix[index, layout.goal.start + index] = -1.0
+    matrix[n:, layout.discs] = np.eye(3 * task.most_discs)
+    for axis, index in enumerate(task.position):
+        matrix[n + axis :: 3, index] = -1.0
     return matrix
 
 
 @dataclass(frozen=True)
 class Actor:
-    """The mean action of an agent on the cart-pole as plain arrays.
+    """The mean action of an agent as plain arrays.
 
     With z = network(clip((F o - mean) / std, +-feature_clip)) the action is clip(z, +-action_clip)
     or action_clip tanh(z).
 
     Attributes:
         network: The layers, tanh between them.
-        features: F, shape (k, 13).
+        features: F, shape (k, o), of observations of o numbers.
         mean: Mean of F o in the training, shape (k,).
         std: Standard deviation of F o in the training, shape (k,), positive.
         feature_clip: Bound on the normalised features.
         action_clip: Bound on the action, in the units of the training.
-        force_scale: Force of the action 1.0 in the training [N].
+        control_scale: Change of each control for the action 1 in the training, shape (m,).
         squash: How the action is bounded, "clip" or "tanh".
         metadata: What `trained_for.weights_record` says of it; stored beside the arrays.
 
@@ -79,18 +79,19 @@ class Actor:
     std: Float32Array
     feature_clip: float
     action_clip: float
-    force_scale: float
+    control_scale: Numbers
     squash: Squash = "clip"
     metadata: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check shapes and values."""
-        count = self.network.inputs
-        if self.network.outputs != 1 or self.features.shape != (count, task.OBSERVATION_DIM):
+        count, outputs = self.network.inputs, self.network.outputs
+        fits = self.features.ndim == 2 and len(self.features) == count
+        if not fits or len(self.control_scale) != outputs:
             raise ValueError(
-                f"features {self.features.shape} and a network of {count} inputs and "
-                f"{self.network.outputs} outputs do not map an observation of "
-                f"{task.OBSERVATION_DIM} to one action"
+                f"features {self.features.shape}, a network of {count} inputs and {outputs} "
+                f"outputs and control_scale={self.control_scale!r} do not map an observation to an "
+                "action"
             )
         for name in ("features", "mean", "std"):
             array = getattr(self, name)
@@ -98,15 +99,17 @@ class Actor:
                 raise ValueError(f"{name} of shape {array.shape} must be finite, one per feature")
         if not np.all(self.std > 0.0):
             raise ValueError("std must be positive")
-        for name in ("feature_clip", "action_clip", "force_scale"):
+        for name in ("feature_clip", "action_clip"):
             check_positive(name, getattr(self, name))
+        for scale in self.control_scale:
+            check_positive("control_scale", scale)
         if self.squash not in SQUASHES:
             raise ValueError(f"squash={self.squash!r} must be one of {', '.join(SQUASHES)}")
 
     @property
-    def largest_force(self) -> float:
-        """The largest force that the actor can ask for [N]."""
-        return self.action_clip * self.force_scale
+    def largest_control(self) -> Numbers:
+        """How far from the centre each control can be asked for, shape (m,)."""
+        return tuple(self.action_clip * scale for scale in self.control_scale)
 
     def save(self, path: Path | str) -> None:
         """Write the actor as safetensors, atomically."""
@@ -122,7 +125,7 @@ class Actor:
             "squash": self.squash,
             "feature_clip": repr(self.feature_clip),
             "action_clip": repr(self.action_clip),
-            "force_scale": repr(self.force_scale),
+            _SCALE: ",".join(map(repr, self.control_scale)),
         }
         write_safetensors(path, tensors, metadata)
 
@@ -153,7 +156,7 @@ class Actor:
                 std=tensors["std"],
                 feature_clip=float(metadata["feature_clip"]),
                 action_clip=float(metadata["action_clip"]),
-                force_scale=float(metadata["force_scale"]),
+                control_scale=tuple(map(float, metadata[_SCALE].split(","))),
                 squash=squash,
                 metadata={name: metadata[name] for name in KEYS if name in metadata},
             )
@@ -167,51 +170,52 @@ class ActorPolicy(BasePolicy):
     """An actor in the place of a controller.
 
     Args:
-        settings: The task; None for the paper's. Where its `force_scale` differs from that of the
-            training, the action is rescaled so that the force stays the same.
-        weights: A file written by `Actor.save`, or the actor itself; None for the shipped one.
+        settings: The task; None for the paper's. Where its `control_scale` differs from that of the
+            training, the action is rescaled so that the control stays the same.
+        weights: A file written by `Actor.save`, or the actor itself; None for the task's own.
         allow_other_settings: Fly settings too for which the actor was not trained.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is damaged, another policy's, or of a training for other settings.
+        ValueError: The file is damaged, another policy's, of other observations, or of a training
+            for other settings.
 
     Attributes:
         actor: The arrays.
-        recorded_as: The policy that the file must name; None takes any.
     """
 
     name = "actor"
-    weights_file = ""
-    recorded_as: str | None = None
     restricted = True  # `policy.make` tells it whether other settings are allowed
 
     def __init__(
         self,
-        settings: task.CartPoleSettings | None = None,
+        settings: Task | None = None,
         weights: Path | str | Actor | None = None,
         allow_other_settings: bool = False,
     ) -> None:
         """Load the actor; see the class for the arguments."""
-        self.settings = settings_of(task.CartPoleSettings(), settings)
-        file = PRETRAINED / self.weights_file if weights is None else weights
-        self.actor = weights = file if isinstance(file, Actor) else Actor.load(file)
-        what = "the actor" if isinstance(file, Actor) else str(file)
-        assumed = cartpole_range(task.CartPoleSettings(), timed=False)
-        check_trained_for(
-            weights.metadata, what, self.recorded_as, self.settings, assumed, allow_other_settings
+        self.settings = task = task_of(settings)
+        if weights is None:
+            weights = found_file(task, f"{self.recorded_as or self.name}.safetensors", "train")
+        self.actor = actor = weights if isinstance(weights, Actor) else Actor.load(weights)
+        what = "the actor" if isinstance(weights, Actor) else str(weights)
+        self._check_episodes = check_weights(
+            task, actor.metadata, what, self, False, allow_other_settings
         )
-        trained = range_of(weights.metadata, what, assumed)
-        self._episodes = EpisodeRange.of(self.name, trained, allow_other_settings)
-        self._network = weights.network
-        self._features = np.ascontiguousarray(weights.features.T)
-        self._mean, self._std = weights.mean, weights.std
-        self._feature_clip = np.float32(weights.feature_clip)
-        self._action_clip = np.float32(weights.action_clip)
-        self._scale = np.float32(weights.force_scale / self.settings.force_scale)
+        sizes = actor.features.shape[1], actor.network.outputs
+        self._size = task.layout.size
+        if sizes != (self._size, task.system.control_dim):
+            raise ValueError(
+                f"{what} maps observations of {sizes[0]} numbers to actions of {sizes[1]}; those "
+                f"of {task.name} have {self._size} and {task.system.control_dim}"
+            )
+        self._features = np.ascontiguousarray(actor.features.T)
+        self._feature_clip = np.float32(actor.feature_clip)
+        self._action_clip = np.float32(actor.action_clip)
+        self._scale = np.divide(actor.control_scale, task.control_scale).astype(np.float32)
 
     @classmethod
-    def load(cls, path: Path | str, settings: task.CartPoleSettings | None = None) -> Self:
+    def load(cls, path: Path | str, settings: Task | None = None) -> Self:
         """Return the policy of a file written by `Actor.save`; raises as the class does."""
         return cls(settings, path)
 
@@ -225,18 +229,18 @@ class ActorPolicy(BasePolicy):
         """Return the mean action and the state as it came; see `Policy.predict`.
 
         Raises:
-            ValueError: The observation is not one of the task, not finite, or of an episode with a
-                goal farther away or a start that leans more than in the training.
+            ValueError: The observation is not one of the task, not finite, or of an episode unlike
+                those of the training.
         """
-        rows = cartpole_rows(observation, np.float32)
-        self._episodes.check(rows[..., _GOAL] - rows[..., _START], rows[..., _LEAN])
+        rows = observed_rows(observation, self._size, np.float32)
+        self._check_episodes(rows)
         features = rows @ self._features
-        features -= self._mean
-        features /= self._std
+        features -= self.actor.mean
+        features /= self.actor.std
         bound = self._feature_clip
         np.minimum(np.maximum(features, -bound, out=features), bound, out=features)
         bound = self._action_clip
-        action = self._network(features)
+        action = self.actor.network(features)
         if self.actor.squash == "tanh":
             action = bound * np.tanh(action)
         else:
@@ -248,18 +252,15 @@ class PpoPolicy(ActorPolicy):
     """The actor of proximal policy optimisation."""
 
     name = recorded_as = "ppo"
-    weights_file = "cartpole_ppo.safetensors"
 
 
 class SacPolicy(ActorPolicy):
     """The mean action of soft actor-critic."""
 
     name = recorded_as = "sac"
-    weights_file = "cartpole_sac.safetensors"
 
 
 class Td3Policy(ActorPolicy):
     """The actor of twin delayed deep deterministic policy gradients."""
 
     name = recorded_as = "td3"
-    weights_file = "cartpole_td3.safetensors"

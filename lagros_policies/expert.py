@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from lagros_envs.aliases import moved_names
 from lagros_envs.dynamics import linearise_hold
 from lagros_envs.task import Feedback, Task
+from lagros_policies.baselines import regulator_weights
 from lagros_policies.contraction import ContractionMetric, HeldControl, load_metric
 from lagros_policies.contraction.feedback import riccati_gains
 from lagros_policies.planning.planner import planner_of
-from lagros_policies.room import found_file, part_of
+from lagros_policies.room import found_file, part_of, shipped_file
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -75,18 +76,6 @@ class Preference(Protocol):
         """
 
 
-def regulator_weights(task: Task) -> Feedback:
-    """Return a task's weights of a regulator: its own, or by Bryson's rule.
-
-    The rule is one over the square of how far a coordinate, or a control, typically moves.
-    """
-    if task.feedback is not None:
-        return task.feedback
-    state = task.state_scale or (1.0,) * task.system.state_dim
-    control = task.control_spread or (1.0,) * task.system.control_dim
-    return Feedback(tuple(x**-2 for x in state), tuple(u**-2 for u in control))
-
-
 class Regulator:
     """A linear-quadratic regulator along the plan, with the weights of the task.
 
@@ -126,7 +115,8 @@ def metric_of(task: Task) -> ContractionMetric:
         FileNotFoundError: None has been made.
         ValueError: The task describes none, or the file is damaged or of another system.
     """
-    if task.metric is None and task.room is None:
+    made = shipped_file(task, "metric.json").is_file()
+    if task.metric is None and task.room is None and not made:
         raise ValueError(
             f"{task.name} has no contraction metric: describe one in its class by `metric = "
             f"MetricDesign(...)`, and make it by `lagros reproduce {task.name}`"

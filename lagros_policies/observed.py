@@ -10,11 +10,8 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import shown
 from lagros_envs.options import real_numbers
-from lagros_envs.tasks.cartpole.task import OBSERVATION_DIM
 
 Number = TypeVar("Number", np.float32, np.float64)
-
-_ONE = (OBSERVATION_DIM,)
 
 
 def as_numbers(observation: Any, dtype: type[Number]) -> NDArray[Number]:
@@ -34,11 +31,12 @@ def as_numbers(observation: Any, dtype: type[Number]) -> NDArray[Number]:
     return numbers.astype(dtype)
 
 
-def cartpole_rows(observation: Any, dtype: type[Number]) -> NDArray[Number]:
-    """Return observations of the cart-pole, (13,) or (B, 13), as an array.
+def observed_rows(observation: Any, size: int, dtype: type[Number]) -> NDArray[Number]:
+    """Return observations, (o,) or (B, o), as an array.
 
     Args:
         observation: As the environment returns it, one or a batch.
+        size: Numbers o of an observation, `task.layout.size`.
         dtype: Single or double precision.
 
     Raises:
@@ -47,13 +45,12 @@ def cartpole_rows(observation: Any, dtype: type[Number]) -> NDArray[Number]:
     rows = as_numbers(observation, dtype)
     # The square is the quickest look at one row: beyond 1e19 it is none of the task, and looked at
     # again.
-    if rows.shape == _ONE and rows.dot(rows) < math.inf:
+    if rows.shape == (size,) and rows.dot(rows) < math.inf:
         return rows
-    if rows.ndim not in (1, 2) or rows.shape[-1] != OBSERVATION_DIM:
+    if rows.ndim not in (1, 2) or rows.shape[-1] != size:
         raise ValueError(
-            f"the observation has shape {rows.shape}; it must be ({OBSERVATION_DIM},), or "
-            f"(B, {OBSERVATION_DIM}) for a batch: build the policy from the environment that it "
-            "flies, without wrappers"
+            f"the observation has shape {rows.shape}; it must be ({size},), or (B, {size}) for a "
+            "batch: build the policy from the environment that it flies, without wrappers"
         )
     if not np.isfinite(rows).all():
         raise ValueError("the observation is not finite")

@@ -10,11 +10,11 @@ from typing import Any, ClassVar, Literal, Protocol, TypeVar, cast, runtime_chec
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.aliases import moved_names
 from lagros_envs.checks import check_flag, shown, suggestion
-from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.task import Described
 from lagros_policies.naming import UserClass, model_file, user_class
-from lagros_policies.tasks.spacecraft import POLICIES as _SPACECRAFT
-from lagros_policies.tasks.spacecraft import told
+from lagros_policies.room import imported, named_in
 from lagros_policies.wrappers import bare_environment
 
 Float32Array = NDArray[np.float32]
@@ -26,9 +26,9 @@ _INTERFACE = "predict(observation, state=None, episode_start=None, deterministic
 # What an object may have beside `predict`.
 _OPTIONAL = ("name", "observes", "reseed", "counters", "bare_forward", "example_features")
 
-# Policies of the cart-pole, and of the spacecraft; each is imported when it is asked for, as torch,
-# solvers and learned weights are needed only then.
-_CARTPOLE = {
+# Policies of every task of one body; each is imported when it is asked for, as torch, solvers and
+# learned weights are needed only then.
+_SINGLE = {
     "learned": "lagros_policies.learned:LearnedPolicy",
     "tube-mpc": "lagros_policies.tube_mpc:TubeMpcPolicy",
     "lagros": "lagros_policies.lagros:LagrosPolicy",
@@ -39,8 +39,8 @@ _CARTPOLE = {
     "td3": "lagros_policies.actor:Td3Policy",
     "residual": "lagros_policies.residual:ResidualPolicy",
 }
-NAMES = tuple(_CARTPOLE)
-SPACECRAFT_NAMES = tuple(_SPACECRAFT)
+NAMES = tuple(_SINGLE)
+__getattr__ = moved_names(__name__)
 
 
 @runtime_checkable
@@ -79,6 +79,7 @@ class BasePolicy:
             a world of many agents.
         prepared: Whether it is built with the bound of the disturbance, as `disturbance_bound`.
         restricted: Whether it is told if other settings are allowed, as `allow_other_settings`.
+        recorded_as: The policy that a file of weights must name to be flown by it; None for any.
         planner: What it plans with; None where it does not plan.
         tracking: The law by which it follows a plan, where its error has a certified bound.
     """
@@ -87,6 +88,7 @@ class BasePolicy:
     observes: Observes = "local"
     prepared: ClassVar[bool] = False
     restricted: ClassVar[bool] = False
+    recorded_as: str | None = None
     planner: Any = None
     tracking: Any = None
 
@@ -262,6 +264,16 @@ def row_memories(
     return [None if start else memory for memory, start in zip(memories, starts, strict=True)]
 
 
+def policy_names(task: Described) -> tuple[str, ...]:
+    """Return the names of the policies of a task."""
+    return tuple(_places(task))
+
+
+def _places(task: Described) -> dict[str, str]:
+    """Return where the policies of a task are, by name."""
+    return {**(_SINGLE if task.most_agents == 1 else {}), **named_in(task, "POLICIES", {})}
+
+
 def make(
     name: str,
     env: Any,
@@ -277,11 +289,11 @@ def make(
     the file says nothing.
 
     Args:
-        name: One of `NAMES` (`SPACECRAFT_NAMES` for the spacecraft); the path of a
-            stable-baselines3 model (`ppo.zip`, `sac:model.zip`); or `module:Class`, a class of your
-            own that is built with the task's settings (and, where its attribute `prepared` is True,
-            with the bound of the disturbance as `disturbance_bound`). A zip of stable-baselines3
-            holds pickled code and a module is code: both run, so name only what you trust.
+        name: One of `policy_names(task)`; the path of a stable-baselines3 model (`ppo.zip`,
+            `sac:model.zip`); or `module:Class`, a class of your own that is built with the task's
+            settings (and, where its attribute `prepared` is True, with the bound of the disturbance
+            as `disturbance_bound`). A zip of stable-baselines3 holds pickled code and a module is
+            code: both run, so name only what you trust.
         env: A Gymnasium or PettingZoo environment of this package, several in a vector, or the id
             of one; the policy takes its task settings (and preset, and the bound of its
             disturbance) and nothing else.
@@ -296,6 +308,7 @@ def make(
         ValueError: The name or the id is unknown, the settings or the preset are others than those
             of the environment, or a wrapper may change what an observation or
             an action means, or the weights are another policy's or were made for other settings.
+        FileNotFoundError: The weights have not been made.
         TypeError: The environment is not one of this package.
         ImportError: A package that the policy needs is not installed.
     """
@@ -306,18 +319,18 @@ def make(
         raise ValueError(f"name={shown(name)} must be text: a name, a path or module:Class")
     if "settings" in settings:
         raise _of_the_environment("settings")
-    if isinstance(world.settings, SpacecraftSettings):
-        classes = _SPACECRAFT
+    task = world.settings
+    classes = _places(task)
+    told = named_in(task, "told", None)
+    if told is not None:
         settings = told(world, settings)
-    else:
-        classes = _CARTPOLE
     if name in classes:
         return _shipped(name, classes[name], world, allow_other_settings, settings)
     model = model_file(name)
     if model is not None:
         from lagros_policies.sb3_model import load_stable_baselines3
 
-        return load_stable_baselines3(model.path, model.algorithm, **settings)
+        return load_stable_baselines3(model.path, model.algorithm, task, **settings)
     own = user_class(name)
     if own is not None:
         return _built(_class_named(name, own), world, allow_other_settings, settings)
@@ -350,10 +363,8 @@ def _built(
 def _shipped(
     name: str, place: str, world: Any, allow_other_settings: bool, settings: dict[str, Any]
 ) -> Policy:
-    module, _, attribute = place.partition(":")
     try:
-        kind = getattr(importlib.import_module(module), attribute)
-        return _built(kind, world, allow_other_settings, settings)
+        return _built(imported(place), world, allow_other_settings, settings)
     except ModuleNotFoundError as error:
         raise ImportError(
             f"policy {name!r} needs {error.name}, which is not installed: "

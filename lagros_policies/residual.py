@@ -1,4 +1,4 @@
-"""LAG-ROS with a learned correction: u = u_L + clip(c, +-beta), |c| at most beta newtons."""
+"""LAG-ROS with a learned correction: u = u_L + clip(c, +-beta), |c| at most beta."""
 
 from __future__ import annotations
 
@@ -8,25 +8,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.conventions import settings_of
-from lagros_envs.tasks.cartpole import task
+from lagros_envs.task import Task
 from lagros_policies.actor import Actor, ActorPolicy
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.policy import BasePolicy, PolicyState
+from lagros_policies.room import task_of
 
 Float32Array = NDArray[np.float32]
 
 
 class Correction(ActorPolicy):
-    """The correction alone, an actor whose largest force is beta."""
+    """The correction alone, an actor whose largest control is beta."""
 
     name = "correction"
     recorded_as = "residual"
-    weights_file = "cartpole_residual.safetensors"
 
 
 class ResidualPolicy(BasePolicy):
-    """The force of LAG-ROS plus a correction that reinforcement learning has trained.
+    """The control of LAG-ROS plus a correction that reinforcement learning has trained.
 
     A correction of at most beta enters Theorem 1 as a learning error does: where its bound holds
     for u_L with the learning error eps_l, that of the sum has eps_l + beta in its place, whatever
@@ -34,8 +33,8 @@ class ResidualPolicy(BasePolicy):
 
     Args:
         settings: The task; None for the paper's.
-        weights: File or arrays of the correction, an `Actor`; None for the shipped one.
-        base: File of the network of LAG-ROS; None for the shipped one.
+        weights: File or arrays of the correction, an `Actor`; None for the task's own.
+        base: File of the network of LAG-ROS; None for the task's own.
         allow_other_settings: Fly settings too for which the networks were not trained.
 
     Raises:
@@ -52,20 +51,21 @@ class ResidualPolicy(BasePolicy):
 
     def __init__(
         self,
-        settings: task.CartPoleSettings | None = None,
+        settings: Task | None = None,
         weights: Path | str | Actor | None = None,
         base: Path | str | None = None,
         allow_other_settings: bool = False,
     ) -> None:
         """Load both networks; see the class for the arguments."""
-        self.settings = settings_of(task.CartPoleSettings(), settings)
-        self.base = LagrosPolicy(self.settings, base, allow_other_settings)
+        self.settings = task_of(settings)
+        base_task: Any = self.settings
+        self.base = LagrosPolicy(base_task, base, allow_other_settings)
         self.correction = Correction(self.settings, weights, allow_other_settings)
 
     @property
     def largest_correction(self) -> float:
-        """The bound beta of the correction [N]."""
-        return self.correction.actor.largest_force
+        """The bound beta of the correction, of the control that it moves most."""
+        return max(self.correction.actor.largest_control)
 
     def predict(
         self,

@@ -7,7 +7,11 @@ module:attribute:
     POLICIES    names of the policies that it adds or replaces
     PLANNER     what plans its target trajectories, of a task (`planning.planner.TaskPlanner`)
     PREFERENCE  what u* prefers along a plan, of a task (`expert.Regulator`)
-    TRAINED     what its networks may fly (`trained_for.Trained`)
+    WEIGHTS     weights of a regulator, of a task (`baselines.bryson_weights`)
+    SPACES      shapes and bounds of its observations and actions (`sb3_model.single_spaces`)
+    TRAINED     what its networks may fly, of a task (`trained_for.Training`)
+
+and the function `told(world, settings)`, what its policies are built with besides the task.
 """
 
 from __future__ import annotations

@@ -5,20 +5,20 @@ from __future__ import annotations
 import importlib
 import io
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.reading import check_file, parse_json
-from lagros_envs.tasks.cartpole import task as cartpole_task
-from lagros_envs.tasks.spacecraft import task as spacecraft_task
-from lagros_envs.tasks.spacecraft.scenarios import Preset, preset_named
-from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_envs.registry import task_named, task_names
+from lagros_envs.task import Described, Task
 from lagros_policies.naming import ALGORITHMS
 from lagros_policies.observed import as_numbers
 from lagros_policies.policy import BasePolicy
+from lagros_policies.room import part_of
 
 Float32Array = NDArray[np.float32]
 
@@ -28,37 +28,63 @@ MOST_EXPANDED = 1 << 28
 MOST_ENTRIES = 100
 
 
+class Spaces(NamedTuple):
+    """What a policy of one agent of a task observes and answers.
+
+    Attributes:
+        observation: Shape of an observation.
+        action: Shape of an action.
+        low: Least entry of an action; the largest is 1.
+        where: Whose they are, for a message.
+    """
+
+    observation: tuple[int, ...]
+    action: tuple[int, ...]
+    low: float
+    where: str
+
+
+def single_spaces(task: Task) -> Spaces:
+    """Return what a policy of a task of one body observes and answers."""
+    return Spaces((task.layout.size,), (task.system.control_dim,), -1.0, f"{task.env_id} has")
+
+
 class StableBaselines3Policy(BasePolicy):
     """A stable-baselines3 model with the interface and the checks of this package.
 
     Args:
-        model: The model. For the cart-pole its observation is the 13 numbers of the task and its
-            action one number; for spacecraft they are those of one agent, which all agents share.
+        model: The model, of observations and actions of the task; where there are many agents, of
+            one of them, and all share it.
         name: Name in tables.
-        preset: Preset (or its name) of the worlds of spacecraft, with the number of their agents;
-            None for the cart-pole.
+        settings: The task; None for the paper's.
+        told: What else the policies of the task are built with, such as a preset.
 
     Raises:
         ValueError: The model was trained on other spaces or within other bounds of the action, or
             there is no such preset.
     """
 
-    def __init__(self, model: Any, name: str, preset: str | Preset | None = None) -> None:
+    def __init__(
+        self, model: Any, name: str, settings: Described | None = None, **told: Any
+    ) -> None:
         """Wrap the model; see the class for the arguments."""
+        task = _usual(told) if settings is None else settings
+        wanted: Spaces = part_of(task, "SPACES", "lagros_policies.sb3_model:single_spaces")(
+            task, **told
+        )
         spaces = model.observation_space.shape, model.action_space.shape
-        expected, where = _expected(None if preset is None else preset_named(preset))
-        if spaces != expected:
+        if spaces != (wanted.observation, wanted.action):
             raise ValueError(
                 f"{name} was trained on observations of shape {spaces[0]} and actions of shape "
-                f"{spaces[1]}; {where} {expected[0]} and {expected[1]}. A model that was trained "
-                "behind wrappers cannot be used without them"
+                f"{spaces[1]}; {wanted.where} {wanted.observation} and {wanted.action}. A model "
+                "that was trained behind wrappers cannot be used without them"
             )
-        low = -1.0 if preset is None else 0.0
-        if not (np.all(model.action_space.low == low) and np.all(model.action_space.high == 1.0)):
+        low, bounds = wanted.low, model.action_space
+        if not (np.all(bounds.low == low) and np.all(bounds.high == 1.0)):
             raise ValueError(
-                f"{name} was trained on actions from {np.min(model.action_space.low):g} to "
-                f"{np.max(model.action_space.high):g}; those of the task are from {low:g} to 1. A "
-                "model that was trained behind wrappers cannot be used without them"
+                f"{name} was trained on actions from {np.min(bounds.low):g} to "
+                f"{np.max(bounds.high):g}; those of the task are from {low:g} to 1. A model that "
+                "was trained behind wrappers cannot be used without them"
             )
         self.name = name
         self.model = model
@@ -82,20 +108,17 @@ class StableBaselines3Policy(BasePolicy):
         return np.asarray(action, np.float32), state
 
 
-def _expected(preset: Preset | None) -> tuple[tuple[tuple[int, ...], tuple[int, ...]], str]:
-    """Return the shapes of observation and action, and whose they are, for a message."""
-    if preset is None:
-        return ((cartpole_task.OBSERVATION_DIM,), (1,)), "lagros/CartPole-v0 has"
-    layout = Layout.for_preset(preset, spacecraft_task.SpacecraftSettings())
-    where = (
-        f"worlds of {preset.agents} agents and at most {preset.obstacle_count[1]} obstacles, for "
-        "which it must be trained, have"
-    )
-    return ((layout.size,), (spacecraft_task.THRUSTERS,)), where
+def _usual(told: Mapping[str, Any]) -> Described:
+    """Return the first task whose policies are told such things."""
+    tasks = [task_named(name) for name in task_names()]
+    return next(task for task in tasks if bool(task.presets) == bool(told))
 
 
 def load_stable_baselines3(
-    path: Path | str, algorithm: str | None = None, preset: str | Preset | None = None
+    path: Path | str,
+    algorithm: str | None = None,
+    settings: Described | None = None,
+    **told: Any,
 ) -> StableBaselines3Policy:
     """Load a model saved by stable-baselines3's `model.save(path)`.
 
@@ -106,7 +129,8 @@ def load_stable_baselines3(
     Args:
         path: The zip file.
         algorithm: One of `ALGORITHMS`, in any case; None to detect it.
-        preset: Of the worlds of spacecraft; None for a model of the cart-pole.
+        settings: As for `StableBaselines3Policy`.
+        told: Likewise.
 
     Returns:
         The policy, on the CPU, named after the file.
@@ -135,7 +159,7 @@ def load_stable_baselines3(
             f"{path} could not be loaded as a {chosen} model of stable-baselines3 "
             f"{library.__version__} ({_line(error)})"
         ) from error
-    return StableBaselines3Policy(model, path.stem, preset)
+    return StableBaselines3Policy(model, path.stem, settings, **told)
 
 
 def detect_algorithm(path: Path | str) -> str:

@@ -8,43 +8,111 @@ train.
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_flag
 from lagros_envs.reading import parse_json
-from lagros_envs.task import Described
-from lagros_envs.tasks.cartpole.physics import CartPole
-from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.task import Described, Task
+from lagros_policies.room import part_of
+
+if TYPE_CHECKING:
+    from lagros_policies.policy import BasePolicy
 
 TASK, POLICY, SETTINGS = KEYS = ("task", "policy", "trained_for")
 Rule = Literal["equal", "at_most", "one_of"]
 # By rule and by name, what the settings of a flight are held against.
 Range = Mapping[str, Mapping[str, Any]]
+# Refuses observations, (o,) or (B, o), of episodes unlike those of the training.
+EpisodeCheck = Callable[[NDArray[Any]], None]
 
 
-def cartpole_range(task: CartPoleSettings, timed: bool) -> Range:
-    """Return what a network of the cart-pole that was trained for a task may fly.
+class Training:
+    """What the networks of a task may fly: what they were trained for, setting by setting.
+
+    A task whose networks may fly more names a class of its own in its room.
 
     Args:
-        task: The task.
-        timed: Whether the network counts on the time at which the episode ends.
+        task: The task of the training.
     """
-    equal = body_values(task.system)
-    equal |= {name: getattr(task, name) for name in ("control_period", "force_limit")}
-    at_most = {name: getattr(task, name) for name in ("initial_angle", "goal_range")}
-    (equal if timed else at_most)["time_limit"] = task.time_limit
-    return {"equal": equal, "at_most": at_most}
+
+    def __init__(self, task: Task) -> None:
+        """Remember the task."""
+        self.task = task
+
+    def range(self, timed: bool) -> Range:
+        """Return what a network may fly.
+
+        Args:
+            timed: Whether the network counts on the time at which the episode ends.
+        """
+        return {"equal": _settings(self.task)}
+
+    def episodes(self, policy: str, trained_for: Range) -> EpisodeCheck:
+        """Return a check of the episodes that a network meets; see `check_weights`.
+
+        Args:
+            policy: Whose network it is, for the message.
+            trained_for: What it may fly.
+        """
+        return every_episode
 
 
-def cartpole_design(system: CartPole) -> Range:
-    """Return what a metric that was designed for a cart-pole may track."""
-    return {"equal": body_values(system)}
+def every_episode(rows: NDArray[Any]) -> None:
+    """Allow every episode."""
+
+
+def training_of(task: Task) -> Training:
+    """Return what the networks of a training for a task may fly."""
+    found: Training = part_of(task, "TRAINED", "lagros_policies.trained_for:Training")(task)
+    return found
+
+
+def usual(task: Task) -> Task:
+    """Return a task with its default settings, for which its files were made."""
+    kind: Any = type(task)
+    try:
+        found: Task = kind()
+        return found
+    except TypeError:  # it has settings without a default
+        return task
+
+
+def check_weights(
+    task: Task,
+    metadata: Mapping[str, str],
+    what: str,
+    policy: BasePolicy,
+    timed: bool,
+    allow_other_settings: bool = False,
+) -> EpisodeCheck:
+    """Check that a network flies as what it was trained, and within what it was trained for.
+
+    Args:
+        task: The task that it is to fly.
+        metadata: Of its weights.
+        what: The weights, for the message.
+        policy: Whose network it is; `recorded_as` is the name that the file must have.
+        timed: As for `Training.range`.
+        allow_other_settings: Do not look at the settings.
+
+    Returns:
+        A function that refuses observations, (o,) or (B, o), of episodes that are unlike those of
+        the training.
+
+    Raises:
+        ValueError: It is another policy's, or the settings are others.
+    """
+    training = training_of(usual(task))
+    assumed = training.range(timed)
+    check_trained_for(metadata, what, policy.recorded_as, task, assumed, allow_other_settings)
+    if allow_other_settings:
+        return every_episode
+    return training.episodes(policy.name, range_of(metadata, what, assumed))
 
 
 def weights_record(task: str, policy: str, trained_for: Range) -> dict[str, str]:
@@ -114,61 +182,6 @@ def range_of(metadata: Mapping[str, str], what: str, assumed: Range) -> Range:
     return value
 
 
-@dataclass(frozen=True)
-class EpisodeRange:
-    """Which episodes a network of the cart-pole may fly: those like the ones of its training.
-
-    Attributes:
-        policy: Whose network it is, for the message.
-        farthest: Largest distance from the start to the goal [m].
-        steepest: Largest angle at the start [rad].
-    """
-
-    policy: str
-    farthest: float = math.inf
-    steepest: float = math.inf
-
-    @classmethod
-    def of(cls, policy: str, trained_for: Range, allow_other_settings: bool) -> EpisodeRange:
-        """Return the range that a record names, or every episode where others are allowed.
-
-        Args:
-            policy: Whose network it is.
-            trained_for: What the network was trained for.
-            allow_other_settings: Whether it may fly all.
-        """
-        if allow_other_settings:
-            return cls(policy)
-        # Of single precision, a hair wider than trained for.
-        farthest, steepest = (
-            (1.0 + 1e-6) * float(trained_for.get("at_most", {}).get(name, math.inf))
-            for name in ("goal_range", "initial_angle")
-        )
-        return cls(policy, farthest, steepest)
-
-    def check(self, ways: NDArray[np.float32], leans: NDArray[np.float32]) -> None:
-        """Check episodes; a single one costs a microsecond.
-
-        Args:
-            ways: p_f - p(0), shape () or (B,) [m].
-            leans: theta(0), of the same shape [rad].
-
-        Raises:
-            ValueError: A goal is farther away, or a start leans more, than in the training.
-        """
-        if ways.ndim == 0:
-            way, lean = abs(ways.item()), abs(leans.item())
-        else:
-            way = float(np.max(np.abs(ways), initial=0.0))
-            lean = float(np.max(np.abs(leans), initial=0.0))
-        if way > self.farthest or lean > self.steepest:
-            raise ValueError(
-                f"the episode goes {way:.3g} m from a lean of {lean:.3g} rad; "
-                f"{self.policy} was trained for at most {self.farthest:.3g} m and "
-                f"{self.steepest:.3g} rad: pass allow_other_settings=True to fly outside of that"
-            )
-
-
 def _needed(trained_for: Range, name: str, value: Any) -> str | None:
     """Return what a setting must be, in words; None if it is, or nothing is said about it."""
     for rule, words in (("equal", ""), ("at_most", "at most "), ("one_of", "one of ")):
@@ -187,11 +200,25 @@ def _needed(trained_for: Range, name: str, value: Any) -> str | None:
 
 
 def _settings(task: Any) -> dict[str, Any]:
-    """Return the settings of a task, and those of its body."""
-    values = {item.name: getattr(task, item.name) for item in fields(task)}
-    return values | body_values(task.system)
+    """Return the settings of a task, those of its body as "system.mass", as JSON keeps them."""
+    values: dict[str, Any] = {}
+    for item in fields(task):
+        value = getattr(task, item.name)
+        if is_dataclass(value):
+            values |= {f"{item.name}.{name}": entry for name, entry in _settings(value).items()}
+        else:
+            values[item.name] = _plain(value)
+    return values
+
+
+def _plain(value: Any) -> Any:
+    """Return a setting as it is read again from JSON."""
+    if isinstance(value, tuple | list | np.ndarray):
+        return [_plain(entry) for entry in value]
+    plain = value is None or isinstance(value, bool | int | float | str)
+    return value if plain else type(value).__name__
 
 
 def body_values(system: Any) -> dict[str, Any]:
     """Return the parameters of a system as ranges name them."""
-    return {f"system.{item.name}": getattr(system, item.name) for item in fields(system)}
+    return {f"system.{name}": value for name, value in _settings(system).items()}

@@ -12,23 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_above, check_whole, shown
-from lagros_envs.conventions import settings_of
-from lagros_envs.tasks.cartpole import task
-from lagros_envs.tasks.cartpole.physics import CartPole
+from lagros_envs.task import Task
 from lagros_policies.contraction import ContractionMetric, load_metric
-from lagros_policies.observed import cartpole_rows
+from lagros_policies.expert import Expert, TrackedPlans
+from lagros_policies.observed import observed_rows
 from lagros_policies.planning import Trajectory
 from lagros_policies.policy import BasePolicy, PolicyState, row_memories
-from lagros_policies.tasks.cartpole.expert import CartPoleExpert, TrackedPlans
-from lagros_policies.tasks.cartpole.planner import FORCE_SLACK
-from lagros_policies.trained_for import cartpole_design, check_trained_for
+from lagros_policies.room import task_of
+from lagros_policies.trained_for import body_values, check_trained_for, usual
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
 
-# Forces that differ by less are one plan; the solver's own tolerance is below it [N].
-_SAME_FORCE = 1e-2
+# Controls that differ by less are one plan, in scales of the plan; the solver's own tolerance is
+# below it.
+_SAME_CONTROL = 1e-2
+# A plan may exceed the bounds of the control by so much, in the same.
+_BOUND_SLACK = 1e-6
 
 
 @dataclass
@@ -38,17 +39,17 @@ class TubeMpcState:
     Attributes:
         plan: The plan in force; its last step is the time limit. None before the first succeeds.
         tracked: The same, prepared for tracking.
-        goal: The goal it was made for.
+        asked: The goal and the discs that it was made for.
         plans: Plans asked for.
         failed_plans: Plans that did not hold; the last one stayed in force.
         late_plans: Plans that took longer than the deadline; the last one stayed in force.
         newest: Control step of the last call; -1 before the first.
-        saturated_steps: Control steps at which u* asked for more than the force limit.
+        saturated_steps: Control steps at which u* asked for more than the bounds of the control.
     """
 
     plan: Trajectory | None = None
     tracked: TrackedPlans | None = None
-    goal: FloatArray = field(default_factory=lambda: np.full(task.STATE_DIM, np.nan))
+    asked: FloatArray = field(default_factory=lambda: np.zeros(0))
     plans: int = 0
     failed_plans: int = 0
     late_plans: int = 0
@@ -61,22 +62,23 @@ class TubeMpcPolicy(BasePolicy):
 
     The plan is renewed from the *nominal* state x_d(t), not from the measured one: the tube of
     Theorem 1 surrounds one continuous target trajectory, and u* deals with the error. A re-plan
-    follows a goal that moves; without one it confirms the plan. If a plan fails or comes late the
-    last one stays in force; before there is any, a late plan is used (the system waits) and a
-    failed one means no force for this step. All of it is counted.
+    follows a goal or discs that move; without that it confirms the plan. If a plan fails or comes
+    late the last one stays in force; before there is any, a late plan is used (the system waits)
+    and a failed one means the reference control for this step. All of it is counted.
 
     Args:
-        settings: The task.
-        metric: The contraction metric, or its file; the shipped one if left out.
+        settings: The task; None for the paper's.
+        metric: The contraction metric, or its file; the task's own if left out.
         replan_every: Control steps between plans.
-        deadline: Delta t_max, after which a plan is late [s].
+        deadline: Delta t_max, after which a plan is late [s]; None for the control period.
         clock: Source of the time, for tests [s].
-        allow_other_settings: Track with the shipped metric also where the cart-pole is another than
+        allow_other_settings: Track with the task's own metric also where the system is another than
             that for which it was designed.
 
     Raises:
-        ValueError: `replan_every` is less than one, the deadline is not positive, or the cart-pole
-            is another.
+        FileNotFoundError: The task's metric has not been made.
+        ValueError: `replan_every` is less than one, the deadline is not positive, or the system is
+            another.
     """
 
     name = "tube-mpc"
@@ -84,29 +86,36 @@ class TubeMpcPolicy(BasePolicy):
 
     def __init__(
         self,
-        settings: task.CartPoleSettings | None = None,
+        settings: Task | None = None,
         metric: ContractionMetric | str | Path | None = None,
         replan_every: int = 1,
-        deadline: float = 0.1,
+        deadline: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
         allow_other_settings: bool = False,
     ) -> None:
         """Build planner and law."""
+        self.settings = task = task_of(settings)
         check_whole("replan_every", replan_every)
+        deadline = task.control_period if deadline is None else deadline
         check_above("deadline", deadline, 0)
-        self.settings = settings_of(task.CartPoleSettings(), settings)
         if metric is None:
-            check_shipped_metric(self.settings, allow_other_settings)
-        if metric is None or isinstance(metric, str | Path):
-            metric = load_metric(metric, task.STATE_DIM)
-        if not all(hasattr(metric, name) for name in ("contraction_rate", "condition_bound")):
+            check_own_metric(task, allow_other_settings)
+        elif isinstance(metric, str | Path):
+            metric = load_metric(metric, task.system.state_dim)
+        elif not all(hasattr(metric, name) for name in ("contraction_rate", "condition_bound")):
             raise ValueError(f"metric={shown(metric)} must be a contraction metric, or its file")
         if not callable(clock):
             raise ValueError(f"clock={shown(clock)} must be a function that returns seconds")
-        self.expert = CartPoleExpert(metric, self.settings)
+        self.expert = Expert(task, metric)
+        self.planner = self.expert.planner
         self.replan_every = replan_every
         self.deadline = deadline
         self._clock = clock
+        self._layout = task.layout
+        self._unit = np.array(task.control_spread or (1.0,) * task.system.control_dim)
+        low, high = np.array(task.control_low), np.array(task.control_high)
+        self._slack = low - _BOUND_SLACK * self._unit, high + _BOUND_SLACK * self._unit
+        self._bounded = bool(np.any(np.isfinite([low, high])))
 
     def predict(
         self,
@@ -121,32 +130,33 @@ class TubeMpcPolicy(BasePolicy):
             ValueError: The observation is not one of the task, or not finite, or the state is not
                 of these rows.
         """
-        rows = np.atleast_2d(cartpole_rows(observation, np.float64))
+        rows = np.atleast_2d(observed_rows(observation, self._layout.size, np.float64))
         memories: list[TubeMpcState | None] = row_memories(
             state, episode_start, len(rows), "episodes", TubeMpcState
         )
         # Copies: what was returned before stays what it was.
         fresh = [TubeMpcState() if memory is None else copy(memory) for memory in memories]
-        force = np.empty((len(rows), 1))
-        for place, row, memory in zip(force, rows, fresh, strict=True):
-            place[:] = self._applied(self._force(row, memory), memory)
-        action = (force / self.settings.force_scale).astype(np.float32)
+        control = np.empty((len(rows), len(self._unit)))
+        for place, row, memory in zip(control, rows, fresh, strict=True):
+            place[:] = self._applied(self._control(row, memory), memory)
+        action = self.settings.action(control).astype(np.float32)
         return (action if np.ndim(observation) == 2 else action[0]), fresh
 
     def counters(self, state: PolicyState) -> dict[str, int]:
         """Return how many plans were made, failed and were late, over the episodes of a state.
 
-        Where the task has a force limit, `saturated_steps` are the control steps at which u* asked
-        for more.
+        Where the control has bounds, `saturated_steps` are the control steps at which u* asked for
+        more.
         """
         names = ["plans", "failed_plans", "late_plans"]
-        if self.settings.force_limit is not None:
+        if self._bounded:
             names.append("saturated_steps")
         return {name: sum(getattr(memory, name) for memory in state) for name in names}
 
-    def _force(self, row: FloatArray, memory: TubeMpcState) -> FloatArray:
-        settings = self.settings
-        step = round(float(row[task.TIME]) / settings.control_period)
+    def _control(self, row: FloatArray, memory: TubeMpcState) -> FloatArray:
+        """Return u*, shape (m,), whatever the bounds of the control are."""
+        task, layout = self.settings, self._layout
+        step = round(float(row[layout.time]) / task.control_period)
         if step < memory.newest:
             raise ValueError(
                 f"the time went back from step {memory.newest} to {step}: pass state=None, or "
@@ -154,57 +164,56 @@ class TubeMpcPolicy(BasePolicy):
             )
         memory.newest = step
         # Past the time limit the plan has ended: hold its last nominal state.
-        step = min(step, settings.steps - 1)
-        goal = row[task.GOAL]
-        moved = not np.array_equal(goal, memory.goal)
+        step = min(step, task.steps - 1)
+        asked = np.concatenate([row[layout.goal], row[layout.discs]])
+        moved = not np.array_equal(asked, memory.asked)
         if memory.plan is None or moved or step % self.replan_every == 0:
-            self._renew(row, goal, step, memory)
+            self._renew(row, asked, step, memory)
         if memory.tracked is None:
-            return np.zeros(1)
-        state = row[None, task.STATE]
-        force = self.expert.wanted(memory.tracked, np.zeros(1, int), np.full(1, step), state)
-        return force.reshape(1)
+            return np.array(task.control_centre, np.float64)
+        state = row[None, layout.state]
+        wanted = self.expert.wanted(memory.tracked, np.zeros(1, int), np.full(1, step), state)
+        control: FloatArray = wanted[0]
+        return control
 
-    def _applied(self, force: FloatArray, memory: TubeMpcState) -> FloatArray:
-        """Return what the limit leaves of a force (1,) [N], and count where it takes some."""
-        limit = self.settings.force_limit
-        if limit is None:
-            return force
-        memory.saturated_steps += bool(abs(force[0]) > limit + FORCE_SLACK)
-        return np.clip(force, -limit, limit)
+    def _applied(self, control: FloatArray, memory: TubeMpcState) -> FloatArray:
+        """Return what the bounds leave of a control (m,), and count where they take some."""
+        if self._bounded:
+            low, high = self._slack
+            memory.saturated_steps += bool(np.any((control < low) | (control > high)))
+        return self.expert.applied(control)
 
-    def _renew(self, row: FloatArray, goal: FloatArray, step: int, memory: TubeMpcState) -> None:
-        plan = memory.plan
+    def _renew(self, row: FloatArray, asked: FloatArray, step: int, memory: TubeMpcState) -> None:
+        plan, layout = memory.plan, self._layout
         if plan is None:
-            start = row[task.STATE] if step else row[task.INITIAL_STATE]
+            start = row[layout.state] if step else row[layout.initial_state]
         else:
             start = plan.states[step - (self.settings.steps - plan.horizon)]
         begun = self._clock()
-        renewed = self.expert.planner.plan(start, goal, step, plan)
+        renewed = self.planner.plan(start, row[layout.goal], step, plan, layout.discs_of(row))
         late = self._clock() - begun > self.deadline
         memory.plans += 1
         memory.late_plans += late
         memory.failed_plans += not renewed.solved
         if not renewed.solved or (late and plan is not None):
             return
-        memory.goal = goal.copy()
-        if plan is not None and _confirms(renewed, plan):
+        memory.asked = asked
+        if plan is not None and self._confirms(renewed, plan):
             return
         memory.plan = renewed
         memory.tracked = self.expert.track(renewed.states[None], renewed.controls[None], step)
 
+    def _confirms(self, renewed: Trajectory, plan: Trajectory) -> bool:
+        """Whether a re-plan is the rest of the plan in force, to the planner's accuracy."""
+        change = np.abs(renewed.controls - plan.controls[-renewed.horizon :]) / self._unit
+        return bool(np.max(change) <= _SAME_CONTROL)
 
-def check_shipped_metric(settings: task.CartPoleSettings, allow_other_settings: bool) -> None:
-    """Check that the shipped metric was designed for the task's cart-pole.
+
+def check_own_metric(task: Task, allow_other_settings: bool) -> None:
+    """Check that a task's own metric was designed for its system.
 
     Raises:
         ValueError: It was designed for another, and no other is allowed.
     """
-    made_for = cartpole_design(CartPole())
-    check_trained_for({}, "the shipped metric", None, settings, made_for, allow_other_settings)
-
-
-def _confirms(renewed: Trajectory, plan: Trajectory) -> bool:
-    """Whether a re-plan is the rest of the plan in force, to the planner's accuracy."""
-    change = np.abs(renewed.controls - plan.controls[-renewed.horizon :])
-    return bool(np.max(change) <= _SAME_FORCE)
+    made_for = {"equal": body_values(usual(task).system)}
+    check_trained_for({}, "the shipped metric", None, task, made_for, allow_other_settings)

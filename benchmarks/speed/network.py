@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 import lagros_envs  # noqa: F401  (registers the environment)
 from lagros_envs.seeding import episode_seeds
 from lagros_policies.lagros import LagrosPolicy
-from lagros_policies.learning.network_policy import PRETRAINED
 from lagros_policies.learning.networks import Mlp
+from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.cartpole.features import FEATURES, cartpole_features
 from lagros_policies.tube_mpc import TubeMpcPolicy
 from speed.report import Section, Target, absent_row, timed_row

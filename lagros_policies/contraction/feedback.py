@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.aliases import moved_names
+
+__getattr__ = moved_names(__name__)
 FloatArray = NDArray[np.float64]
 
 # The terminal weight, in units of the last stage weight.

@@ -16,8 +16,9 @@ from lagros_envs.tasks.spacecraft.task import THRUSTERS, SpacecraftSettings
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.learned import LearnedPolicy
 from lagros_policies.learning.deep_set import DeepSet
-from lagros_policies.learning.network_policy import PRETRAINED, NetworkPolicy
+from lagros_policies.learning.network_policy import NetworkPolicy
 from lagros_policies.learning.networks import Mlp
+from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.cartpole.features import cartpole_features
 from lagros_policies.tasks.spacecraft.network_policy import (
     SpacecraftLagrosPolicy,

@@ -12,20 +12,13 @@ from lagros_envs.conventions import settings_of
 from lagros_envs.tasks.cartpole import task
 from lagros_policies.learning.features import See
 from lagros_policies.learning.networks import Mlp
-from lagros_policies.observed import cartpole_rows
+from lagros_policies.observed import observed_rows
 from lagros_policies.policy import BasePolicy, PolicyState
+from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.cartpole.features import FEATURES, cartpole_features, see
-from lagros_policies.trained_for import (
-    EpisodeRange,
-    cartpole_range,
-    check_trained_for,
-    range_of,
-)
+from lagros_policies.trained_for import check_weights
 
 Float32Array = NDArray[np.float32]
-# Of the features, what an episode asks for.
-_WAY, _LEAN = FEATURES.index("goal - start [m]"), FEATURES.index("initial angle [rad]")
-PRETRAINED = Path(__file__).parents[1] / "pretrained"
 
 
 class NetworkPolicy(BasePolicy):
@@ -42,14 +35,12 @@ class NetworkPolicy(BasePolicy):
             trained for other settings.
 
     Attributes:
-        recorded_as: The policy that the file must name; None takes any.
         see: What the network sees of an observation, and the signs of its outputs.
     """
 
     see: ClassVar[See] = staticmethod(see)
     name: str
     weights_file: str
-    recorded_as: str | None = None
     restricted = True  # `policy.make` tells it whether other settings are allowed
 
     def __init__(
@@ -67,17 +58,9 @@ class NetworkPolicy(BasePolicy):
                 f"{path} has {self.network.inputs} inputs and {self.network.outputs} outputs; "
                 f"a cart-pole network has {len(FEATURES)} and 1"
             )
-        assumed = cartpole_range(task.CartPoleSettings(), timed=True)
-        check_trained_for(
-            self.network.metadata,
-            str(path),
-            self.recorded_as,
-            self.settings,
-            assumed,
-            allow_other_settings,
+        self._check_episodes = check_weights(
+            self.settings, self.network.metadata, str(path), self, True, allow_other_settings
         )
-        trained = range_of(self.network.metadata, str(path), assumed)
-        self._episodes = EpisodeRange.of(self.name, trained, allow_other_settings)
         self._unit = np.float32(1.0 / self.settings.force_scale)
 
     def predict(
@@ -93,8 +76,9 @@ class NetworkPolicy(BasePolicy):
             ValueError: The observation is not one of the task, not finite, or of an episode with a
                 goal farther away or a start that leans more than in the training.
         """
-        features, side = cartpole_features(cartpole_rows(observation, np.float32))
-        self._episodes.check(features[..., _WAY], features[..., _LEAN])
+        rows = observed_rows(observation, task.OBSERVATION_DIM, np.float32)
+        self._check_episodes(rows)
+        features, side = cartpole_features(rows)
         force = self.network(features)
         return force * (side[..., None] * self._unit), state
 

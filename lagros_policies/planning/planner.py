@@ -165,6 +165,8 @@ def _filled(given: Numbers, count: int, none: float) -> FloatArray:
 def _discs(
     task: Task, discs: FloatArray, start: FloatArray, goal: FloatArray, steps: int
 ) -> Discs | None:
+    # Rows of zeros stand for discs that are missing.
+    discs = discs[discs[:, 2] > 0.0]
     if not len(discs) or not task.position:
         return None
     first, second = task.position

@@ -25,7 +25,7 @@ from lagros_envs.tasks.cartpole import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.contraction.metric import ContractionMetric
-from lagros_policies.observed import cartpole_rows
+from lagros_policies.observed import observed_rows
 from lagros_policies.policy import PolicyState, row_memories
 from lagros_policies.remarks.adaptive import (
     AdaptiveControl,
@@ -36,7 +36,7 @@ from lagros_policies.remarks.adaptive import (
 from lagros_policies.remarks.lagrangian import SlidingAxis, SlidingTracking
 from lagros_policies.remarks.neural.metric import load_neural_metric
 from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
-from lagros_policies.tube_mpc import TubeMpcPolicy, TubeMpcState, check_shipped_metric
+from lagros_policies.tube_mpc import TubeMpcPolicy, TubeMpcState, check_own_metric
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
@@ -77,9 +77,7 @@ class NeuralTubeMpcPolicy(TubeMpcPolicy):
     ) -> None:
         """Read the network and build planner and law."""
         if metric is None:
-            check_shipped_metric(
-                settings_of(task.CartPoleSettings(), settings), allow_other_settings
-            )
+            check_own_metric(settings_of(task.CartPoleSettings(), settings), allow_other_settings)
         super().__init__(settings, load_neural_metric(metric), replan_every, deadline, clock)
 
 
@@ -151,13 +149,13 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Plan, learn and track; see `Policy.predict`. The state is one per row."""
-        count = len(np.atleast_2d(cartpole_rows(observation, np.float64)))
+        count = len(np.atleast_2d(observed_rows(observation, task.OBSERVATION_DIM, np.float64)))
         memories = row_memories(state, episode_start, count, "episodes", AdaptiveState)
         fresh = [AdaptiveState() if memory is None else memory for memory in memories]
         return super().predict(observation, fresh, None, deterministic)
 
-    def _force(self, row: FloatArray, memory: Any) -> FloatArray:
-        wanted = super()._force(row, memory)
+    def _control(self, row: FloatArray, memory: Any) -> FloatArray:
+        wanted = super()._control(row, memory)
         if memory.tracked is None:
             return wanted
         state = row[task.STATE]

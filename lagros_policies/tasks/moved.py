@@ -49,6 +49,8 @@ _MOVED = {
 MOVED = {f"lagros_policies.{old}": f"lagros_policies.{new}" for old, new in _MOVED.items()}
 # As in `lagros_envs.tasks.moved`.
 NAMES = {
+    "lagros_policies.contraction.feedback": "lagros_policies.tasks.cartpole.feedback",
+    "lagros_policies.policy": {"SPACECRAFT_NAMES": "lagros_policies.tasks.spacecraft"},
     "lagros_policies.expert": "lagros_policies.tasks.cartpole.expert",
     "lagros_policies.safety": "lagros_policies.tasks.spacecraft.safety_filter",
 }

@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 from lagros_benchmarks.commands import cli
 from lagros_benchmarks.commands.extras import MODULES, install_hint
 from lagros_benchmarks.run import library
-from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
+from lagros_policies.policy import NAMES
+from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 from tests.benchmarks import fakes
 from tests.lowest import lowest
 
@@ -180,7 +181,8 @@ def test_every_policy_flies_with_its_extra_alone(project):
     code = f"""{absent(with_extra_alone(project, "policies"))}
 import gymnasium, lagros_envs, lagros_policies, numpy as np
 from lagros_envs import spacecraft_v0
-from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
+from lagros_policies.policy import NAMES
+from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 
 env = gymnasium.make("lagros/CartPole-v0")
 for name in NAMES:
@@ -206,7 +208,8 @@ def test_every_policy_names_the_extra_that_flies_it(project):
     code = f"""{absent(MODULES["policies"])}
 import gymnasium, lagros_envs, lagros_policies
 from lagros_envs import spacecraft_v0
-from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
+from lagros_policies.policy import NAMES
+from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 
 for env, names in (
     (gymnasium.make("lagros/CartPole-v0"), NAMES),

@@ -17,7 +17,8 @@ from lagros_benchmarks.report.records import summarise
 from lagros_benchmarks.run import files
 from lagros_benchmarks.run.runner import run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings
-from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
+from lagros_policies.policy import NAMES
+from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 from tests.benchmarks import fakes
 
 POLICIES = ("steady", "idle", "raising")

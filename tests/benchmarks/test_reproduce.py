@@ -16,10 +16,10 @@ from lagros_benchmarks.tasks.spacecraft.reproduce import (
 )
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.learning.dataset import ExpertDataSettings
-from lagros_policies.learning.network_policy import PRETRAINED
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.learning.train import TrainingSettings
 from lagros_policies.learning.train_deep_set import DeepSetTraining
+from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.cartpole.metric_design import MetricDesignSettings
 from lagros_policies.tasks.spacecraft.flights import FlightData, FlightSettings
 

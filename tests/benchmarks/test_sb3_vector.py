@@ -101,10 +101,10 @@ def test_features_map_the_last_observation_too():
         settings = CartPoleSettings(time_limit=0.2)
         return SB3VectorEnv(CartPoleVectorEnv(3, settings=settings, autoreset_mode="same_step"))
 
-    plain, mapped = adapter(), LinearFeatures(adapter(), goal_frame())
+    plain, mapped = adapter(), LinearFeatures(adapter(), goal_frame(CartPoleSettings()))
     plain.seed(2)
     mapped.seed(2)
-    matrix = goal_frame()
+    matrix = goal_frame(CartPoleSettings())
     np.testing.assert_allclose(mapped.reset(), plain.reset() @ matrix.T, atol=1e-6)
     for _ in range(2):
         action = np.full((3, 1), 0.1, np.float32)

@@ -7,7 +7,7 @@ import pytest
 import lagros_policies
 from lagros_benchmarks.run.settings import BenchmarkSettings, check_policy
 from lagros_envs.seeding import EVALUATION, episode_seeds
-from lagros_policies.policy import SPACECRAFT_NAMES
+from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 
 
 @pytest.mark.parametrize(

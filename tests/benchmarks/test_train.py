@@ -418,7 +418,7 @@ def test_the_figures_count_what_happens_before_the_first_fall():
         std=np.ones(4, np.float32),
         feature_clip=1.0,
         action_clip=1.0,
-        force_scale=40.0,
+        control_scale=(40.0,),
     )
     figures = cartpole.evaluate(Never(weights=actor), episode_seeds(1, 50), "none", 0.0)
     assert figures["fallen"] == 1.0

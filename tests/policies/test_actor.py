@@ -16,7 +16,6 @@ from lagros_envs.tasks.cartpole.env import CartPoleEnv
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
 from lagros_policies.actor import (
-    PRETRAINED,
     Actor,
     ActorPolicy,
     PpoPolicy,
@@ -27,8 +26,10 @@ from lagros_policies.actor import (
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.learning.networks import Mlp, read_safetensors, write_safetensors
 from lagros_policies.residual import ResidualPolicy
+from lagros_policies.room import PRETRAINED
 
 TANH = {"net_arch": [16, 8], "activation_fn": torch.nn.Tanh}
+FRAME = goal_frame(CartPoleSettings())
 CLASSES = {"ppo": PPO, "sac": SAC, "td3": TD3}
 
 
@@ -64,13 +65,13 @@ def observations():
 
 @pytest.fixture(scope="module")
 def actor():
-    return extract_actor(agent(PPO, goal_frame()))
+    return extract_actor(agent(PPO, FRAME))
 
 
 @pytest.mark.parametrize("name", CLASSES)
 @pytest.mark.parametrize("plain", [True, False])
 def test_the_numpy_actor_acts_as_torch(name, plain, observations):
-    features = None if plain else goal_frame() / np.array([5.0, 1.0, 5.0, 3.0])[:, None]
+    features = None if plain else FRAME / np.array([5.0, 1.0, 5.0, 3.0])[:, None]
     model = agent(CLASSES[name], features)
     # Rows that no episode would show, far ones among them.
     policy = ActorPolicy(weights=extract_actor(model), allow_other_settings=True)
@@ -172,9 +173,9 @@ def test_files_that_hold_something_else_are_named(actor, tmp_path):
     [
         {"std": np.zeros(4, np.float32)},
         {"mean": np.zeros(3, np.float32)},
-        {"features": np.zeros((4, 5), np.float32)},
+        {"features": np.zeros((3, 13), np.float32)},
         {"action_clip": 0.0},
-        {"force_scale": float("nan")},
+        {"control_scale": (float("nan"),)},
         {"squash": "round"},
     ],
 )
@@ -190,12 +191,12 @@ def constant(force, scale=4.0):
     """Return an actor that always asks for one force [N]."""
     return Actor(
         network=Mlp([np.zeros((4, 1))], [np.array([force / scale])]),
-        features=goal_frame().astype(np.float32),
+        features=FRAME.astype(np.float32),
         mean=np.zeros(4, np.float32),
         std=np.ones(4, np.float32),
         feature_clip=10.0,
         action_clip=1.0,
-        force_scale=scale,
+        control_scale=(scale,),
     )
 
 

@@ -181,7 +181,7 @@ def test_damaged_and_foreign_files_are_refused(weights, tmp_path):
         DeepSet.load(bad)
     with pytest.raises(FileNotFoundError):
         DeepSet.load(tmp_path / "none.safetensors")
-    from lagros_policies.learning.network_policy import PRETRAINED
+    from lagros_policies.room import PRETRAINED
 
     with pytest.raises(ValueError, match="not a deep set"):
         DeepSet.load(PRETRAINED / "cartpole_lagros.safetensors")

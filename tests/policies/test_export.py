@@ -12,8 +12,8 @@ from lagros_policies.export import check, load_source
 from lagros_policies.export.c99 import TANH_ERROR, TANHS, c_source
 from lagros_policies.export.onnx import network_model, policy_model
 from lagros_policies.export.source import CARTPOLE_NAMES, example_observations
-from lagros_policies.learning.network_policy import PRETRAINED
 from lagros_policies.learning.networks import Mlp
+from lagros_policies.room import PRETRAINED
 
 needs_compiler = pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
 needs_onnx = pytest.mark.skipif(not check.has_onnxruntime(), reason="no onnxruntime")

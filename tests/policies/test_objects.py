@@ -20,7 +20,7 @@ from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies import NAMES, make
-from lagros_policies.policy import SPACECRAFT_NAMES
+from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 
 OPTIONS = "lagros_policies.remarks.policies:"

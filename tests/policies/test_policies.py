@@ -110,7 +110,7 @@ import numpy as np
 import lagros_policies
 from lagros_envs import spacecraft_v0
 from lagros_envs.tasks.cartpole.env import CartPoleEnv
-from lagros_policies.policy import SPACECRAFT_NAMES
+from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 failed = []
 for names, env in (
     (lagros_policies.NAMES, CartPoleEnv()),

@@ -20,9 +20,9 @@ from lagros_policies.contraction import (
     load_metric,
 )
 from lagros_policies.learning.dataset import ExpertDataSettings, generate
-from lagros_policies.learning.network_policy import PRETRAINED
 from lagros_policies.learning.networks import Mlp, read_safetensors
 from lagros_policies.learning.train import learning_error
+from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 from lagros_policies.tasks.cartpole.features import cartpole_features
 

@@ -10,8 +10,8 @@ from lagros_envs import spacecraft_v0
 from lagros_envs.seeding import EVALUATION, episode_seeds
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.learning.deep_set import DeepSet
-from lagros_policies.learning.network_policy import PRETRAINED
-from lagros_policies.policy import SPACECRAFT_NAMES
+from lagros_policies.room import PRETRAINED
+from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 
 WORLDS, AGENTS = 12, 6

@@ -10,9 +10,9 @@ from lagros_envs import spacecraft_v0
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.tasks.spacecraft.scenarios import PRESETS
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
-from lagros_policies.actor import PRETRAINED
 from lagros_policies.learning.networks import Mlp
-from lagros_policies.policy import SPACECRAFT_NAMES
+from lagros_policies.room import PRETRAINED
+from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 from lagros_policies.tasks.spacecraft.ppo import FEATURES, WRENCH, SpacecraftPpoPolicy
 
 WEIGHTS = PRETRAINED / SpacecraftPpoPolicy.weights_file

@@ -19,10 +19,10 @@ from lagros_policies import NAMES, make
 from lagros_policies.actor import Actor
 from lagros_policies.contraction import load_metric
 from lagros_policies.export.source import load_source
-from lagros_policies.learning.network_policy import PRETRAINED
 from lagros_policies.learning.networks import read_safetensors, write_safetensors
-from lagros_policies.policy import SPACECRAFT_NAMES
-from lagros_policies.trained_for import SETTINGS, cartpole_range, weights_record
+from lagros_policies.room import PRETRAINED
+from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
+from lagros_policies.trained_for import SETTINGS, training_of, weights_record
 
 CARTPOLE_NETWORKS = ("learned", "lagros", "ppo", "sac", "td3", "residual")
 SPACECRAFT_NETWORKS = ("learned", "lagros", "ppo")
@@ -185,7 +185,7 @@ def test_a_file_without_a_record_counts_as_of_the_papers_task(tmp_path):
 def test_a_record_of_another_task_is_for_that_task(tmp_path):
     longer = CartPoleSettings(time_limit=18.0, control_period=0.2)
     actor = Actor.load(PRETRAINED / "cartpole_ppo.safetensors")
-    metadata = weights_record("cartpole", "ppo", cartpole_range(longer, timed=True))
+    metadata = weights_record("cartpole", "ppo", training_of(longer).range(timed=True))
     file = tmp_path / "longer.safetensors"
     dataclasses.replace(actor, metadata=metadata).save(file)
     assert Actor.load(file).metadata == metadata

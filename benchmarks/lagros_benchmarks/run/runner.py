@@ -21,6 +21,7 @@ from lagros_benchmarks.tasks.cartpole.experiment import CartPoleExperiment
 from lagros_benchmarks.tasks.spacecraft.experiment import Scene, SpacecraftExperiment
 from lagros_benchmarks.tasks.spacecraft.experiment import fly_scene as fly_world
 from lagros_envs.checks import check_instance, shown
+from lagros_envs.registry import task_named
 from lagros_policies.backends import running
 
 __all__ = [
@@ -153,9 +154,9 @@ def _with_policies(
     settings: BenchmarkSettings, toolbox: Toolbox | None, policies: Mapping[str, Policy]
 ) -> tuple[BenchmarkSettings, Toolbox]:
     """Return settings that name all policies and a toolbox that makes them."""
-    from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
+    from lagros_policies.policy import policy_names
 
-    taken = NAMES if settings.task == "cartpole" else SPACECRAFT_NAMES
+    taken = policy_names(task_named(settings.task))
     if not isinstance(policies, Mapping):
         raise ValueError(f"policies={shown(policies)} must be a dictionary of objects by name")
     for name in policies:

@@ -16,6 +16,7 @@ from lagros_envs.checks import (
     suggestion,
 )
 from lagros_envs.disturbances import KINDS
+from lagros_envs.registry import task_named
 from lagros_envs.seeding import EVALUATION, episode_seeds
 from lagros_policies.backends import LOKY, Backend
 
@@ -91,9 +92,9 @@ def check_policy(name: str, task: str = "cartpole") -> None:
         ValueError: It is neither.
     """
     from lagros_policies.naming import is_file, is_importable, model_file, user_class
-    from lagros_policies.policy import NAMES, SPACECRAFT_NAMES
+    from lagros_policies.policy import policy_names
 
-    names = NAMES if task == "cartpole" else SPACECRAFT_NAMES
+    names = policy_names(task_named(task))
     if name in names:
         return
     model = model_file(name)

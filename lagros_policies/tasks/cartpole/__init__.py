@@ -1,4 +1,6 @@
-"""What is special to the cart-pole."""
+"""What is special to the cart-pole; see `lagros_policies.room`."""
 
 PLANNER = "lagros_policies.tasks.cartpole.planner:CartPolePlanner"
 PREFERENCE = "lagros_policies.tasks.cartpole.feedback:GatedRegulator"
+TRAINED = "lagros_policies.tasks.cartpole.trained:CartPoleTraining"
+WEIGHTS = "lagros_policies.tasks.cartpole.bryson:upright_weights"

@@ -13,6 +13,8 @@ POLICIES = {
     "centralized": "lagros_policies.tasks.spacecraft.centralized:CentralizedPolicy",
     "ppo": "lagros_policies.tasks.spacecraft.ppo:SpacecraftPpoPolicy",
 }
+SPACECRAFT_NAMES = tuple(POLICIES)  # the older name of `policy_names`
+SPACES = "lagros_policies.tasks.spacecraft.setup:spaces"
 
 
 def told(world: Any, given: Mapping[str, Any]) -> dict[str, Any]:

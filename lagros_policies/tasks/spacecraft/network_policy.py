@@ -12,10 +12,10 @@ from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.learning.deep_set import DeepSet, SetFeatures
-from lagros_policies.learning.network_policy import PRETRAINED
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.observed import as_numbers
 from lagros_policies.policy import BasePolicy, PolicyState
+from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.spacecraft.features import NEIGHBOUR, OBSTACLE, OWN, spacecraft_features
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.setup import (

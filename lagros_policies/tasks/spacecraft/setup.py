@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from lagros_envs.conventions import settings_of
 from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN
 from lagros_envs.tasks.spacecraft.scenarios import Preset, preset_named
-from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_envs.tasks.spacecraft.task import THRUSTERS, SpacecraftSettings
+from lagros_policies.sb3_model import Spaces
 from lagros_policies.trained_for import Range, body_values
 
 if TYPE_CHECKING:
@@ -49,6 +51,16 @@ def task_and_preset(
         settings_of(SpacecraftSettings(), settings),
         preset_named(preset).for_agents(num_agents),
     )
+
+
+def spaces(task: SpacecraftSettings, preset: str | Preset) -> Spaces:
+    """Return what a policy of one agent observes and answers; see `sb3_model.single_spaces`."""
+    chosen = preset_named(preset)
+    where = (
+        f"worlds of {chosen.agents} agents and at most {chosen.obstacle_count[1]} obstacles, for "
+        "which it must be trained, have"
+    )
+    return Spaces((Layout.for_preset(chosen, task).size,), (THRUSTERS,), 0.0, where)
 
 
 def spacecraft_range(task: SpacecraftSettings, presets: Iterable[str | Preset]) -> Range:

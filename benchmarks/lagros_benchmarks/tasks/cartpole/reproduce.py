@@ -32,7 +32,7 @@ from lagros_policies.tasks.cartpole.metric_design import (
     MetricDesignSettings,
     design_cartpole_metric,
 )
-from lagros_policies.trained_for import cartpole_range, weights_record
+from lagros_policies.trained_for import training_of, weights_record
 
 Float32Array = NDArray[np.float32]
 
@@ -184,7 +184,7 @@ def _network(
             folder / f"{name}_checkpoint.safetensors",
             lambda epoch, _: update(f"train {name}", epoch, training.epochs),
         )
-        trained_for = cartpole_range(CartPoleSettings(), timed=True)
+        trained_for = training_of(CartPoleSettings()).range(timed=True)
         network.metadata.update(weights_record("cartpole", name, trained_for))
         network.metadata["inputs"] = ", ".join(FEATURES)
         network.save(weights)

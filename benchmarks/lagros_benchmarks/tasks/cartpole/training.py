@@ -30,7 +30,7 @@ from lagros_policies.actor import Actor, ActorPolicy, goal_frame
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.policy import Policy
 from lagros_policies.residual import ResidualPolicy
-from lagros_policies.trained_for import cartpole_range, weights_record
+from lagros_policies.trained_for import training_of, weights_record
 
 # What is large on this task, for the features of an agent without running normalisation: the
 # farthest goal [m], a start [rad], and the rates of a cart that hurries there [m/s, rad/s].
@@ -114,9 +114,9 @@ class CartPoleLesson:
         if isinstance(training.algorithm, OffPolicy):
             # A buffer of old features must not change its meaning: their scale is fixed.
             scales = np.array(FEATURE_SCALES)[:, None]
-            self.venv: VecEnv = LinearFeatures(venv, goal_frame() / scales)
+            self.venv: VecEnv = LinearFeatures(venv, goal_frame(settings) / scales)
         else:
-            features = LinearFeatures(venv, goal_frame())
+            features = LinearFeatures(venv, goal_frame(settings))
             self.venv = VecNormalize(features, gamma=training.algorithm.discount)
 
     def policy(self, model: BaseAlgorithm) -> Policy:
@@ -159,7 +159,7 @@ class CartPoleLesson:
         """Write the actor as safetensors."""
         plain = self.training.largest_correction is None
         name = self.training.algorithm.name if plain else "residual"
-        metadata = weights_record("cartpole", name, cartpole_range(self.settings, timed=False))
+        metadata = weights_record("cartpole", name, training_of(self.settings).range(timed=False))
         replace(extract_actor(model, self.force_scale), metadata=metadata).save(path)
 
 
@@ -193,7 +193,7 @@ def extract_actor(model: BaseAlgorithm, force_scale: float = 40.0) -> Actor:
         std=std.astype(np.float32),
         feature_clip=clip,
         action_clip=float(space.high[0]),
-        force_scale=force_scale,
+        control_scale=(force_scale,),
         squash="clip" if isinstance(model, PPO) else "tanh",
     )
 
