@@ -45,7 +45,8 @@ from lagros_policies.contraction.held_design import (
     design_held_contained,
 )
 from lagros_policies.contraction.held_ellipsoid import HeldTubeProof, prove_held_tube
-from lagros_policies.contraction.tube_design import PlanBox, TubeDesign, design_contained
+from lagros_policies.contraction.tube_design import TubeDesign, design_contained
+from lagros_policies.tasks.cartpole.plans import PlanBox
 from lagros_policies.tasks.spacecraft.ellipsoid_axis import (
     design_axis_ellipsoid,
     prove_axis_ellipsoid,

@@ -19,8 +19,9 @@ from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction.ellipsoid import TubeControl
 from lagros_policies.contraction.held_design import HeldTube
-from lagros_policies.contraction.tube_design import ConstantTube, PlanBox
+from lagros_policies.contraction.tube_design import ConstantTube
 from lagros_policies.tasks.cartpole.planner import CartPolePlanner
+from lagros_policies.tasks.cartpole.plans import PlanBox
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

@@ -59,10 +59,10 @@ from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tube import PaperTube
 from lagros_policies.contraction.held_design import HeldDesign, HeldTube, design_held_contained
 from lagros_policies.contraction.held_ellipsoid import prove_held_tube
-from lagros_policies.contraction.tube_design import PlanBox
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 from lagros_policies.tasks.cartpole.planner import CartPolePlanner
+from lagros_policies.tasks.cartpole.plans import PlanBox
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

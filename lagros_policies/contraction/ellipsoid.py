@@ -11,21 +11,21 @@ enclosure.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import control_matrix, vector_field
+from lagros_envs.dynamics import System, control_matrix, vector_field
 from lagros_envs.numbers import Interval, exact
-from lagros_envs.tasks.cartpole.physics import CartPole
+from lagros_policies.contraction.basis import CONSTANT
 from lagros_policies.contraction.metric import Metric
-from lagros_policies.contraction.regions import Region
-from lagros_policies.contraction.systems import check_cartpole
+from lagros_policies.contraction.regions import BoxRegion
 from lagros_policies.contraction.tube_design import ConstantTube, TubeDesign
-from lagros_policies.proof.cells import Examined, Search, search
+from lagros_policies.proof.cells import Search, search
+from lagros_policies.proof.families import BoxCondition, Violation, rate_matrices
 from lagros_policies.proof.matrices import negative_definite
-from lagros_policies.proof.rates import RateCondition, Violation, rate_condition
+from lagros_policies.proof.sets import triples
 
 FloatArray = NDArray[np.float64]
 
@@ -34,33 +34,6 @@ _TINY = 1e-300
 # Cells of one pass, and of a whole search.
 _BATCH = 100
 _MOST_CELLS = 1_000_000
-
-
-class SourceCondition:
-    """The matrices of Theorem 2's condition plus a multiple of the identity.
-
-    Args:
-        condition: The condition without it.
-        source: An enclosure of the multiple, of no dimension.
-    """
-
-    def __init__(self, condition: RateCondition, source: Interval) -> None:
-        """Keep both."""
-        self.condition, self.source = condition, source
-
-    def start(self) -> Interval:
-        """Return cells that cover the set."""
-        return self.condition.start()
-
-    def examine(self, cells: Interval) -> Examined:
-        """Enclose the matrices over cells (k, 3)."""
-        found = self.condition.examine(cells)
-        eye = np.eye(found.corners.shape[-1])
-        return replace(found, corners=found.corners + self.source * eye)
-
-    def failure(self, cells: Interval) -> Violation | None:
-        """Return a point at which the condition fails even without the source, or None."""
-        return self.condition.failure(cells)
 
 
 @dataclass(frozen=True)
@@ -83,26 +56,19 @@ class TubeProof:
 
 def as_metric(tube: ConstantTube) -> Metric:
     """Return the constant metric of a tube, for what takes a `Metric`."""
-    box = tube.proof_box
-    region = Region(
-        angle=box.angle,
-        angular_rate=box.angular_rate,
-        angle_error=max(box.angle_error, 1e-9),
-        angular_rate_error=max(box.angular_rate_error, 1e-9),
-        force=max(box.force, 1e-9),
-    )
-    values = np.linalg.eigvalsh(tube.dual)
+    values, box = np.linalg.eigvalsh(tube.dual), tube.proof_box
     return Metric(
         coefficients=tube.dual[None],
         contraction_rate=tube.design.rate,
         condition_bound=float(values[-1] / values[0]),
         control_weight=tube.control_weight,
         scaling=np.ones(len(tube.dual)),
-        region=region,
+        region=box if isinstance(box, BoxRegion) else box.region,
+        basis=CONSTANT,
     )
 
 
-def prove_tube(system: CartPole, tube: ConstantTube, most_seconds: float = 60.0) -> TubeProof:
+def prove_tube(system: System, tube: ConstantTube, most_seconds: float = 60.0) -> TubeProof:
     """Prove a tube on the continuous box of its condition, or say that there is no proof.
 
     What is proved: for every target trajectory in `tube.plan`, from e(0) = 0, under every
@@ -111,7 +77,7 @@ def prove_tube(system: CartPole, tube: ConstantTube, most_seconds: float = 60.0)
     constant, so that no disturbance enters dM/dt; the tube keeps x in the box by itself.
 
     Args:
-        system: A cart-pole.
+        system: The system.
         tube: The tube.
         most_seconds: Time after which the search gives up [s].
 
@@ -119,15 +85,14 @@ def prove_tube(system: CartPole, tube: ConstantTube, most_seconds: float = 60.0)
         The proof.
 
     Raises:
-        TypeError: The system is no cart-pole.
+        TypeError: The system is not that of the tube.
     """
-    check_cartpole(system, "prove_tube")
     start = time.monotonic()
     if not tube.least_eigenvalue > 0.0:
         return TubeProof(tube, Search(False, 0, 0.0), False, time.monotonic() - start)
-    condition = rate_condition(system, as_metric(tube), tube.proof_box, tube.design.rate)
-    pushed = SourceCondition(condition, _source(tube.design))
-    found = search(pushed, _BATCH, _MOST_CELLS, most_seconds)
+    matrices = rate_matrices(system, as_metric(tube), tube.design.rate, _source(tube.design))
+    condition = BoxCondition(triples(tube.proof_box, system, "state"), matrices)
+    found = search(condition, _BATCH, _MOST_CELLS, most_seconds)
     eye = np.eye(len(tube.dual))
     definite = bool(negative_definite(tube.least_eigenvalue * eye - exact(tube.dual)))
     proved = found.proved and definite and tube.contained
@@ -147,15 +112,11 @@ class TubeControl:
         tube: The tube.
 
     Raises:
-        TypeError: The system is no cart-pole.
+        TypeError: The system is not that of the tube.
     """
 
-    system: CartPole
+    system: System
     tube: ConstantTube
-
-    def __post_init__(self) -> None:
-        """Check the system."""
-        check_cartpole(self.system, "TubeControl")
 
     def terms(
         self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
@@ -189,8 +150,8 @@ class TubeControl:
         return control
 
 
-def _source(design: TubeDesign) -> Interval:
+def _source(design: TubeDesign) -> Interval | None:
     """Enclose what the disturbance adds, w_bar^2 / (2 alpha) for the ellipsoid and else nothing."""
     if design.method != "ellipsoid":
-        return exact(0.0)
+        return None
     return exact(design.disturbance_bound).square() / (exact(design.rate) * 2.0)

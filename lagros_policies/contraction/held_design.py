@@ -37,24 +37,15 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
-from lagros_envs.dynamics import System, control_matrix, jacobian
-from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY
+from lagros_envs.dynamics import System
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.semidefinite import solve_conic, svec, symmetric_basis
-from lagros_policies.contraction.systems import check_cartpole
-from lagros_policies.contraction.tube_design import PlanBox, self_contained
-from lagros_policies.proof.box import ProofBox
+from lagros_policies.contraction.systems import check_sizes
+from lagros_policies.contraction.tube_design import Plans, self_contained
 
 FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
-_STATES = 4
-_SIZE = _STATES + 1
-# The program is solved for v in units of 10 N and for w_bar = 1: entries of one size.
-_FORCE = 10.0
-# Angles of x, and of y around each, at which the condition is imposed. Each program has but those
-# that matter: the outermost first, then the worst that its answer violates.
-_ANGLES = 9
+# Each program has but the samples that matter: some first, then the worst that its answer violates.
 _WORST = 30
 _ROUNDS = 40
 # W_0 exceeds W_N by this share, so that the proof of (**) has room for its rounding.
@@ -69,13 +60,14 @@ class HeldDesign:
     Attributes:
         period: The hold h [s].
         rate: alpha [1/s].
-        output: c, shape (4,): what the tube should be narrow in; None for the whole state.
+        output: c, shape (n,): what the tube should be narrow in; None for the whole state.
         disturbance_bound: w_bar, in units of the state per second.
-        control_penalty: Weight of Z, the square of the force, in the objective, which is in units
-            of w_bar^2 [1/N^2].
-        floor: Least eigenvalue of every Q_i in units of w_bar^2, with v in units of 10 N.
+        control_penalty: Weight of Z, the square of v, in the objective, which is in units
+            of w_bar^2.
+        floor: Least eigenvalue of every Q_i in units of w_bar^2, with v in `control_unit`.
         margin: Added to alpha at the samples, so that the condition holds between them [1/s].
         degree: N.
+        control_unit: In which the program counts v: entries of one size.
         aperiodic: Whether every sequence of holds of at most h is to be covered.
 
     Raises:
@@ -90,17 +82,17 @@ class HeldDesign:
     floor: float = 1e-3
     margin: float = 0.03
     degree: int = 6
+    control_unit: float = 10.0
     aperiodic: bool = False
 
     def __post_init__(self) -> None:
         """Check the values."""
         check_fields(self)
-        for name in ("period", "rate", "disturbance_bound", "control_penalty", "floor"):
+        positive = "period", "rate", "disturbance_bound", "control_penalty", "floor", "control_unit"
+        for name in positive:
             check_positive(name, getattr(self, name))
         check_not_negative("margin", self.margin)
         check_whole("degree", self.degree)
-        if self.output is not None and len(self.output) != _STATES:
-            raise ValueError(f"output={self.output!r} must have {_STATES} entries")
 
 
 @dataclass(frozen=True)
@@ -109,44 +101,50 @@ class HeldTube:
 
     Attributes:
         design: What it was designed for.
-        duals: Q_i, shape (N + 1, 5, 5), of z = (e, v).
-        gain: K, shape (1, 4).
-        plan: Where the target trajectories lie.
-        error: Errors for which the condition was imposed, shape (4,).
+        duals: Q_i, shape (N + 1, n + m, n + m), of z = (e, v).
+        gain: K, shape (m, n).
+        plan: Where the target trajectories lie, some `Plans`.
+        error: Errors for which the condition was imposed, shape (n,).
     """
 
     design: HeldDesign
     duals: FloatArray
     gain: FloatArray
-    plan: PlanBox
+    plan: Any
     error: FloatArray
+
+    @property
+    def states(self) -> int:
+        """Number n of states."""
+        return int(self.gain.shape[1])
 
     @property
     def steady_radius(self) -> float:
         """The bound of ||e|| at all times, as time goes on."""
-        values = np.linalg.eigvalsh(self.duals[:, :_STATES, :_STATES])
+        values = np.linalg.eigvalsh(self.duals[:, : self.states, : self.states])
         return math.sqrt(float(values.max())) * (1.0 + _ROUNDING)
 
     @property
     def steady_outputs(self) -> FloatArray:
-        """The bounds of each |e_i| at all times, as time goes on, shape (4,)."""
-        entries = np.diagonal(self.duals, axis1=1, axis2=2)[:, :_STATES]
+        """The bounds of each |e_i| at all times, as time goes on, shape (n,)."""
+        entries = np.diagonal(self.duals, axis1=1, axis2=2)[:, : self.states]
         bounds: FloatArray = np.sqrt(entries.max(axis=0)) * (1.0 + _ROUNDING)
         return bounds
 
     @property
     def largest_deviation(self) -> float:
-        """The bound of |u - u_d| = |K e| [N]."""
-        return math.sqrt(float(self.duals[0, _STATES, _STATES])) * (1.0 + _ROUNDING)
+        """The bound of ||u - u_d|| = ||K e||."""
+        block = self.duals[0, self.states :, self.states :]
+        return math.sqrt(float(np.linalg.eigvalsh(block)[-1])) * (1.0 + _ROUNDING)
 
     @property
     def contained(self) -> bool:
-        """Whether the tube stays where the condition was imposed; the position is free."""
-        places = [ANGLE, VELOCITY, ANGULAR_RATE]
+        """Whether the tube stays where the condition was imposed."""
+        places = self.plan.bounded
         return bool(np.all(self.steady_outputs[places] <= self.error[places]))
 
     @property
-    def proof_box(self) -> ProofBox:
+    def proof_box(self) -> Any:
         """The box of x, x_d and u_d on which the condition is asked for."""
         return self.plan.with_errors(self.error)
 
@@ -155,13 +153,13 @@ class HeldTube:
         return np.sqrt(-np.expm1(-2.0 * self.design.rate * np.asarray(time, dtype=np.float64)))
 
     def output_radius(self, direction: FloatArray, time: Any) -> Any:
-        """Return the bound of |c'e(t)| for c of shape (4,) at times t [s] after e(0) = 0."""
-        blocks = self.duals[:, :_STATES, :_STATES]
+        """Return the bound of |c'e(t)| for c of shape (n,) at times t [s] after e(0) = 0."""
+        blocks = self.duals[:, : self.states, : self.states]
         square = float(np.max(blocks @ direction @ direction))
         return math.sqrt(square) * self.share(time)
 
     def dual_at(self, phase: float) -> FloatArray:
-        """Return Q(s), shape (5, 5).
+        """Return Q(s), shape (n + m, n + m).
 
         Args:
             phase: s / h, from 0 to 1.
@@ -176,8 +174,8 @@ class HeldTube:
 
         Args:
             phase: s / h, from 0 to 1.
-            error: e, shape (..., 4).
-            deviation: v, the deviation that is held, shape (..., 1) [N].
+            error: e, shape (..., n).
+            deviation: v, the deviation that is held, shape (..., m).
         """
         z = np.concatenate([error, deviation], axis=-1)
         value: FloatArray = np.sum(z @ np.linalg.inv(self.dual_at(phase)) * z, axis=-1)
@@ -186,39 +184,42 @@ class HeldTube:
     def control(
         self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
     ) -> FloatArray:
-        """Return u = u_d + K (x - x_d), shape (..., 1), to be held [N].
+        """Return u = u_d + K (x - x_d), shape (..., m), to be held.
 
         Args:
-            state: x, shape (..., 4).
-            nominal: x_d, shape (..., 4).
-            nominal_control: u_d, shape (..., 1).
+            state: x, shape (..., n).
+            nominal: x_d, shape (..., n).
+            nominal_control: u_d, shape (..., m).
         """
         control: FloatArray = nominal_control + (state - nominal) @ self.gain.T
         return control
 
 
-def design_held(system: System, plan: PlanBox, error: FloatArray, design: HeldDesign) -> HeldTube:
+def design_held(system: System, plan: Plans, error: FloatArray, design: HeldDesign) -> HeldTube:
     """Solve the program on samples of a box (not yet proved).
 
     Args:
-        system: A cart-pole.
-        plan: Where the target trajectories lie.
-        error: Largest |x - x_d|, shape (4,); that of the position does not matter.
+        system: The system.
+        plan: Where the target trajectories lie, some `Plans`.
+        error: Largest |x - x_d|, shape (n,).
         design: What to design.
 
     Returns:
         The tube.
 
     Raises:
-        TypeError: The system is no cart-pole.
+        TypeError: The system is not that of the plans.
         InfeasibleError: There is no such tube.
         RuntimeError: The solver stopped for another reason.
-        ValueError: The box reaches pi/2.
+        ValueError: There is no such box.
     """
-    check_cartpole(system, "design_held")
-    lifted, chosen = _samples(system, plan.with_errors(error))
+    n, m = system.state_dim, system.control_dim
+    if design.output is not None:
+        check_sizes(system, output=(np.array(design.output), (n,)))
+    slope, gain, chosen = plan.held_samples(system, error)
+    lifted = _lifted(slope, gain, design.control_unit)
     for _ in range(_ROUNDS):
-        duals, status = _solve(lifted[chosen], design)
+        duals, status = _solve(lifted[chosen], design, n)
         if duals is None and "Infeasible" in status:
             raise InfeasibleError(
                 f"no held tube with alpha={design.rate} and period={design.period} exists for "
@@ -227,7 +228,7 @@ def design_held(system: System, plan: PlanBox, error: FloatArray, design: HeldDe
             )
         if duals is None:
             raise RuntimeError(f"the program stopped with status {status} for {design}")
-        residual = _residual(lifted, duals, design)
+        residual = _residual(lifted, duals, design, n)
         worst = np.argsort(residual)[-_WORST:]
         worst = worst[residual[worst] > 0.0]
         if not len(worst):
@@ -235,19 +236,19 @@ def design_held(system: System, plan: PlanBox, error: FloatArray, design: HeldDe
         chosen[worst] = True
     else:
         raise RuntimeError(f"the samples still fail after {_ROUNDS} rounds for {design}")
-    units = design.disturbance_bound * np.array([1.0] * _STATES + [_FORCE])
+    units = design.disturbance_bound * np.array([1.0] * n + [design.control_unit] * m)
     duals = duals * (units[:, None] * units)
     first = duals[0]
-    feedback = np.linalg.solve(first[:_STATES, :_STATES], first[:_STATES, _STATES:]).T
+    feedback = np.linalg.solve(first[:n, :n], first[:n, n:]).T
     return HeldTube(design, duals, feedback, plan, error)
 
 
-def design_held_contained(system: System, plan: PlanBox, design: HeldDesign) -> HeldTube:
+def design_held_contained(system: System, plan: Plans, design: HeldDesign) -> HeldTube:
     """Design a tube on the errors that it allows itself: from none, until both meet.
 
     Args:
-        system: A cart-pole.
-        plan: Where the target trajectories lie.
+        system: The system.
+        plan: Where the target trajectories lie, some `Plans`.
         design: What to design.
 
     Returns:
@@ -260,6 +261,7 @@ def design_held_contained(system: System, plan: PlanBox, design: HeldDesign) -> 
     return self_contained(
         lambda error: design_held(system, plan, error, design),
         f"disturbance_bound={design.disturbance_bound} held for {design.period} s around {plan}",
+        system.state_dim,
     )
 
 
@@ -279,40 +281,18 @@ def bernstein_rate(degree: int) -> list[dict[int, float]]:
     return rows
 
 
-def _samples(system: System, box: ProofBox) -> tuple[FloatArray, BoolArray]:
-    """Return [J B; 0 0] at points of a box, (s, 5, 5), and which to begin with, (s,)."""
-    error = min(box.angle_error, 2.0 * box.angle)
-    gaps = np.linspace(-error, error, _ANGLES)
-    # Where y reaches the edge of the box is one of them.
-    angles = np.append(np.linspace(0.0, box.angle, _ANGLES), abs(box.angle - error))
-    place, offset, drive = (
-        part.ravel()
-        for part in np.meshgrid(range(len(angles)), range(len(gaps)), [-1.0, 1.0], indexing="ij")
-    )
-    outer = np.isin(place, [0, _ANGLES - 1]) & np.isin(offset, [0, _ANGLES - 1])
-    angle, gap = angles[place.astype(np.intp)], gaps[offset.astype(np.intp)]
-    x, y = np.zeros((2, len(angle), _STATES))
-    x[:, ANGLE], y[:, ANGLE] = angle, np.clip(angle + gap, -box.angle, box.angle)
-    # Friction makes a velocity act like a force: the two are extreme together.
-    y[:, VELOCITY] = -drive * box.velocity
-    slopes = []
-    for rate in (-box.angular_rate, 0.0, box.angular_rate):
-        y[:, ANGULAR_RATE] = rate
-        slopes.append(jacobian(system, y, drive[:, None] * box.force)[0])
-    behind, still, ahead = slopes
-    # J is affine in (w, w^2): the proof takes the corners of the tangents to the parabola.
-    tip = 0.25 * (ahead - behind)
-    corners = np.concatenate([behind, ahead, still - tip, still + tip])
-    lifted = np.zeros((len(corners), _SIZE, _SIZE))
-    lifted[:, :_STATES, :_STATES] = corners
-    lifted[:, :_STATES, _STATES:] = _FORCE * np.tile(control_matrix(system, x), (4, 1, 1))
-    return lifted, np.tile(outer, 4)
+def _lifted(slope: FloatArray, gain: FloatArray, unit: float) -> FloatArray:
+    """Return [J B; 0 0] at samples, (s, n + m, n + m), with v in its unit."""
+    n, size = slope.shape[-1], slope.shape[-1] + gain.shape[-1]
+    lifted = np.zeros((len(slope), size, size))
+    lifted[:, :n, :n], lifted[:, :n, n:] = slope, unit * gain
+    return lifted
 
 
-def _residual(lifted: FloatArray, duals: FloatArray, design: HeldDesign) -> FloatArray:
+def _residual(lifted: FloatArray, duals: FloatArray, design: HeldDesign, n: int) -> FloatArray:
     """Return the largest eigenvalue of (*) at samples (s,), with half of the margin, (s,)."""
     rate = 2.0 * design.rate + design.margin
-    source = np.diag([1.0] * _STATES + [0.0]) / (2.0 * design.rate)
+    source = _pushed(n, lifted.shape[-1]) / (2.0 * design.rate)
     worst = np.full(len(lifted), -math.inf)
     for dual, row in zip(duals, bernstein_rate(design.degree), strict=True):
         moved = sum(weight / design.period * duals[index] for index, weight in row.items())
@@ -322,18 +302,24 @@ def _residual(lifted: FloatArray, duals: FloatArray, design: HeldDesign) -> Floa
     return worst
 
 
-def _solve(lifted: FloatArray, design: HeldDesign) -> tuple[FloatArray | None, str]:
+def _pushed(n: int, size: int) -> FloatArray:
+    """Return E E', the part of (e, v) that a disturbance pushes."""
+    return np.diag(np.arange(size) < n).astype(np.float64)
+
+
+def _solve(lifted: FloatArray, design: HeldDesign, n: int) -> tuple[FloatArray | None, str]:
     """Minimise t + lambda Z_0 over Q_0 ... Q_N and t for w_bar = 1; return them and the status."""
     import clarabel
 
-    basis = symmetric_basis(_SIZE)
+    whole = lifted.shape[-1]
+    basis = symmetric_basis(whole)
     size, count = len(basis), design.degree + 1
     columns = count * size + 1
-    error_part = svec(basis[:, :_STATES, :_STATES]).T
+    error_part = svec(basis[:, :n, :n]).T
     product = np.einsum("sab,jbc->sjac", lifted, basis)
     product = product + np.swapaxes(product, -1, -2) + 2.0 * (design.rate + design.margin) * basis
     motion = np.swapaxes(svec(product), -1, -2)
-    source = np.diag([1.0] * _STATES + [0.0]) / (2.0 * design.rate)
+    source = _pushed(n, whole) / (2.0 * design.rate)
     blocks: list[FloatArray] = []
     rights: list[FloatArray] = []
     cones: list[Any] = []
@@ -349,23 +335,24 @@ def _solve(lifted: FloatArray, design: HeldDesign) -> tuple[FloatArray | None, s
         rights.append(right)
         cones.append(clarabel.PSDTriangleConeT(round(math.sqrt(2 * len(right) + 0.25) - 0.5)))
 
-    full = svec(basis).T
+    full, nothing = svec(basis).T, np.zeros(len(error_part))
     for index, rate in enumerate(bernstein_rate(design.degree)):
         still = {place: -weight / design.period * full for place, weight in rate.items()}
         for one in motion:
             moving = one + still.get(index, 0.0)
             impose({**still, index: moving}, None, -svec(source))
-        impose({index: -full}, None, -design.floor * svec(np.eye(_SIZE)))
+        impose({index: -full}, None, -design.floor * svec(np.eye(whole)))
         if index == design.degree or (design.aperiodic and index > 0):
-            impose({0: -error_part, index: (1.0 + _SLACK) * error_part}, None, np.zeros(10))
+            impose({0: -error_part, index: (1.0 + _SLACK) * error_part}, None, nothing)
         if design.output is None:
-            impose({index: error_part}, -svec(np.eye(_STATES)), np.zeros(10))
+            impose({index: error_part}, -svec(np.eye(n)), nothing)
         else:
             c = np.array(design.output)
-            width = basis[:, :_STATES, :_STATES] @ c @ c
+            width = basis[:, :n, :n] @ c @ c
             impose({index: width[None]}, np.array([-1.0]), np.zeros(1))
     cost = np.zeros(columns)
-    cost[:size] = design.control_penalty * _FORCE**2 * basis[:, -1, -1]
+    effort = np.trace(basis[:, n:, n:], axis1=1, axis2=2)
+    cost[:size] = design.control_penalty * design.control_unit**2 * effort
     cost[-1] = 1.0
     rows = sparse.csc_matrix(np.vstack(blocks))
     values, status = solve_conic(cost, rows, np.concatenate(rights), cones)

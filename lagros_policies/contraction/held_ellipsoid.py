@@ -8,19 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.aliases import moved_names
+from lagros_envs.dynamics import System
 from lagros_envs.numbers import Interval, exact
-from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction.held_design import HeldTube, bernstein_rate
-from lagros_policies.contraction.statement import Statement, at_most
-from lagros_policies.contraction.systems import check_cartpole
 from lagros_policies.proof.cells import Search, search
-from lagros_policies.proof.lifted import LiftedCondition
+from lagros_policies.proof.families import BoxCondition, Violation, lifted_matrices
 from lagros_policies.proof.matrices import matmul, negative_definite, transpose
-from lagros_policies.proof.rates import Violation
+from lagros_policies.proof.sets import triples
 
+__getattr__ = moved_names(__name__)
 FloatArray = NDArray[np.float64]
 
-_STATES = 4
 # The shortest hold that is covered, as a share of the longest, where shorter ones are.
 SHORTEST = 1e-6
 # Cells of one pass, and of a whole search.
@@ -54,7 +53,7 @@ class HeldTubeProof:
         return sum(one.cells for one in self.conditions)
 
 
-def prove_held_tube(system: CartPole, tube: HeldTube, most_seconds: float = 60.0) -> HeldTubeProof:
+def prove_held_tube(system: System, tube: HeldTube, most_seconds: float = 60.0) -> HeldTubeProof:
     """Prove the tube of a held control, or say that there is no proof.
 
     What is proved: for every target trajectory in `tube.plan`, from e(0) = 0, under every
@@ -64,7 +63,7 @@ def prove_held_tube(system: CartPole, tube: HeldTube, most_seconds: float = 60.0
     motion.
 
     Args:
-        system: A cart-pole.
+        system: The system.
         tube: The tube.
         most_seconds: Processor time after which each of N + 1 searches gives up [s].
 
@@ -72,41 +71,21 @@ def prove_held_tube(system: CartPole, tube: HeldTube, most_seconds: float = 60.0
         The proof.
 
     Raises:
-        TypeError: The system is no cart-pole.
+        TypeError: The system is not that of the tube.
     """
-    check_cartpole(system, "prove_held_tube")
     start = time.monotonic()
     definite = bool(np.all(negative_definite(exact(-tube.duals))))
     jumps = _falls_at_instants(tube)
     found: list[Search[Violation]] = []
+    where = triples(tube.proof_box, system, "state")
     if definite and jumps and tube.contained:
         for dual, rest in zip(tube.duals, _rests(tube), strict=True):
-            condition = LiftedCondition(system, tube.proof_box, dual, rest)
+            condition = BoxCondition(where, lifted_matrices(system, dual, rest))
             found.append(search(condition, _BATCH, _MOST_CELLS, most_seconds))
             if not found[-1].proved:
                 break
     proved = len(found) == len(tube.duals) and found[-1].proved
     return HeldTubeProof(tube, tuple(found), jumps, proved, time.monotonic() - start)
-
-
-def held_statement(tube: HeldTube, proof: HeldTubeProof) -> Statement:
-    """Return a tube of a held control as a line of a certificate."""
-    p, angle = tube.steady_outputs[[0, 1]]
-    plan, design = tube.plan, tube.design
-    holds = f"holds of {SHORTEST * design.period:g} to" if design.aperiodic else "held"
-    return Statement(
-        f"ellipsoid tube, control {holds} {design.period:g} s, at the instants and between them, "
-        f"all disturbances up to {design.disturbance_bound:g}, e(0) = 0: |theta - theta_d| "
-        f"<= {at_most(angle)} rad, |p - p_d| <= {at_most(p)} m, ||e|| <= "
-        f"{at_most(tube.steady_radius)}, |u - u_d| <= {at_most(tube.largest_deviation)} N for "
-        f"u = u_d + K e, K = {np.round(tube.gain[0], 3).tolist()} (rounded); it keeps the state in "
-        f"its box while |theta_d| <= {plan.angle:g} rad, |p_d'| <= {plan.velocity:g} m/s, "
-        f"|theta_d'| <= "
-        f"{plan.angular_rate:g} rad/s and |u_d| <= {plan.force:g} N",
-        "proved",
-        proof.proved,
-        proof.seconds,
-    )
 
 
 def _falls_at_instants(tube: HeldTube) -> bool:
@@ -117,10 +96,10 @@ def _falls_at_instants(tube: HeldTube) -> bool:
     D_i + c D_0 with D_i = Q_0 - L W_i L', i >= 1 and c from 0 to r, whose ends decide. D_0 alone is
     zero but for its last entry, and K is rounded: holds as short as one likes are out of reach.
     """
-    joined = exact(np.concatenate([np.eye(_STATES), tube.gain]))
+    joined = exact(np.concatenate([np.eye(tube.states), tube.gain]))
 
     def rises(index: int) -> Interval:
-        block = exact(tube.duals[index, :_STATES, :_STATES])
+        block = exact(tube.duals[index, : tube.states, : tube.states])
         return matmul(matmul(joined, block), transpose(joined)) - exact(tube.duals[0])
 
     if not tube.design.aperiodic:
@@ -131,11 +110,11 @@ def _falls_at_instants(tube: HeldTube) -> bool:
 
 
 def _rests(tube: HeldTube) -> list[Interval]:
-    """Enclose 2 alpha Q_i - (dQ/ds)_i + w_bar^2 / (2 alpha) E E', each (5, 5)."""
+    """Enclose 2 alpha Q_i - (dQ/ds)_i + w_bar^2 / (2 alpha) E E', each (n + m, n + m)."""
     design = tube.design
     period, rate = exact(design.period), exact(design.rate)
     source = exact(design.disturbance_bound).square() / (rate * 2.0)
-    pushed = np.diag([1.0] * _STATES + [0.0])
+    pushed = np.diag(np.arange(tube.duals.shape[-1]) < tube.states).astype(np.float64)
     rests = []
     for index, row in enumerate(bernstein_rate(design.degree)):
         total = exact(tube.duals[index]) * (rate * 2.0) + source * pushed

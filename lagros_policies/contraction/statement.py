@@ -23,6 +23,7 @@ class Statement:
         holds: Whether the claim was established. A proof that was not found is a statement that
             does not hold, whether or not its opposite was shown.
         seconds: Time that the evidence took [s].
+        refuted: Whether the opposite was shown.
 
     Raises:
         ValueError: The text is empty, the kind unknown or the time negative or not finite.
@@ -32,6 +33,7 @@ class Statement:
     kind: Kind
     holds: bool
     seconds: float
+    refuted: bool = False
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -40,6 +42,13 @@ class Statement:
         if self.kind not in get_args(Kind):
             raise ValueError(f"kind={self.kind!r} must be one of {', '.join(get_args(Kind))}")
         check_not_negative("seconds", self.seconds)
+
+    @property
+    def verdict(self) -> str:
+        """Return "yes", "NO", or "not shown" where neither a proof was found nor its opposite."""
+        if self.holds:
+            return "yes"
+        return "not shown" if self.kind == "proved" and not self.refuted else "NO"
 
 
 def at_most(value: float, digits: int = 4) -> str:

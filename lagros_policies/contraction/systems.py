@@ -1,8 +1,7 @@
 """Which systems the functions of this package are for: everything else is refused by name.
 
-Most take any control-affine `System`, with a metric of x only if the control does not move it
-(`check_unmoved`); one of x_d serves the others. What uses the equations of the cart-pole (proofs,
-corners of boxes) is for it alone, not for a class derived from it, whose equation may be another.
+They take any control-affine `System`, with a metric of x only if the control does not move it
+(`check_unmoved`); one of x_d serves the others.
 """
 
 from __future__ import annotations
@@ -13,12 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import shown
 from lagros_envs.dynamics import System
-from lagros_envs.tasks.cartpole.physics import ANGLE, CartPole
-from lagros_policies.contraction.basis import Basis, cosines
+from lagros_policies.contraction.basis import Basis
 from lagros_policies.contraction.metric import DualMetric, Metric
-from lagros_policies.contraction.regions import Region
 
 FloatArray = NDArray[np.float64]
 
@@ -26,42 +22,18 @@ FloatArray = NDArray[np.float64]
 _ROUNDING = 1e-9
 
 
-def check_cartpole(system: Any, what: str) -> CartPole:
-    """Return a system that is the cart-pole, and refuse every other.
+def check_polynomial(metric: Any, what: str) -> None:
+    """Refuse what is no `Metric`: of a network, say, nothing is proved.
 
     Args:
-        system: The system.
-        what: Who uses its structure, as the message names it.
+        metric: The metric.
+        what: Who uses its coefficients, as the message names it.
 
     Raises:
-        TypeError: It is no `CartPole`, or of a class derived from it.
-    """
-    _check_class("system", system, CartPole, what)
-    cartpole: CartPole = system
-    return cartpole
-
-
-def check_cartpole_metric(metric: Any, what: str) -> None:
-    """Refuse what is no polynomial metric of the cart-pole's states; arguments as above.
-
-    Raises:
-        TypeError: It is no `Metric`: of a network, say, nothing is proved.
-        ValueError: It is of other than four states, or not of cos(theta) on a `Region`.
+        TypeError: It is another.
     """
     if not isinstance(metric, Metric):
         raise TypeError(f"metric={metric!r} must be a Metric: {what} uses its coefficients")
-    if len(metric.scaling) != CartPole().state_dim:
-        raise ValueError(
-            f"the metric is of {len(metric.scaling)} states: {what} is for those of the cart-pole, "
-            "[p, theta, dp/dt, dtheta/dt]"
-        )
-    angle = metric.point == "state" and metric.phi == cosines(ANGLE, len(metric.coefficients) - 1)
-    if not angle or not isinstance(metric.region, Region):
-        raise ValueError(
-            f"the metric is of {shown(metric.phi.terms)} at the {metric.point}, on a "
-            f"{type(metric.region).__name__}: {what} is for 1, cos(x[{ANGLE}]), ... at the state, "
-            "on a Region"
-        )
 
 
 def check_sizes(system: System, **arrays: tuple[FloatArray, tuple[int, ...]]) -> None:
@@ -129,11 +101,3 @@ def _check_still(
                 f"x={state[worst].tolist()}, so that dW_bar/dt depends on a control that is not "
                 'chosen yet: take a basis of other coordinates, or one of x_d (point="nominal")'
             )
-
-
-def _check_class(name: str, value: Any, wanted: type, what: str) -> None:
-    if type(value) is not wanted:
-        raise TypeError(
-            f"{name}={value!r} must be a {wanted.__name__}: {what} uses the structure of its "
-            "equations, which no other class is known to have"
-        )

@@ -22,88 +22,18 @@ it holds (14) does, and not the reverse.
 
 from __future__ import annotations
 
-import math
-import time
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_at_least, check_not_negative, check_positive
+from lagros_envs.aliases import moved_names
+from lagros_envs.checks import check_not_negative
 from lagros_envs.dynamics import System, control_matrix
-from lagros_envs.numbers import Interval, exact, variable
-from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction.condition import Samples, condition_left
 from lagros_policies.contraction.control import contraction_terms
 from lagros_policies.contraction.metric import DualMetric, Metric, metric_place
-from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
-from lagros_policies.proof.box import ProofBox
-from lagros_policies.proof.matrices import negative_definite
-from lagros_policies.proof.motion import accelerations, jacobian_parts, metric_series
 
+__getattr__ = moved_names(__name__)
 FloatArray = NDArray[np.float64]
-
-# Above what sampling finds by this share, so that the intervals can show it.
-_ROOM = 1.01
-# Rounding of a norm or an eigenvalue of a 4 by 4 matrix, relative to its Frobenius norm.
-_ROUNDING = 1e-12
-
-
-@dataclass(frozen=True, slots=True)
-class Lipschitz:
-    """A proved Lipschitz constant of x -> f(x) + B(x) u_d, for u_d that does not answer to x.
-
-    Attributes:
-        upper: L_f, proved: ||d(f + B u_d)/dx|| is nowhere larger [1/s].
-        lower: The largest norm that was found at a point [1/s].
-        growth: Proved bound of the largest eigenvalue of the symmetric part, which also bounds the
-            growth of an error, and is smaller [1/s].
-        seconds: Time taken [s].
-    """
-
-    upper: float
-    lower: float
-    growth: float
-    seconds: float
-
-
-def metric_drift(metric: Metric, angle: float, cells: int = 2000) -> float:
-    """Return a proved kappa [1/rad] with -kappa W <= dW/dtheta <= kappa W for |theta| <= angle.
-
-    Args:
-        metric: The metric; for a constant one kappa is zero.
-        angle: Largest |theta| [rad].
-        cells: Equal intervals of the angle.
-
-    Raises:
-        ValueError: It cannot be shown with so many cells.
-    """
-    check_cartpole_metric(metric, "metric_drift")
-    check_positive("angle", angle)
-    check_at_least("cells", cells, 1)
-    if metric.degree == 0:
-        return 0.0
-    # W is even in the angle: one half of it will do.
-    ends = np.linspace(0.0, angle, cells + 1)
-    angles = Interval(ends[:-1], ends[1:])
-    middle = angles.midpoint
-    gap = (angles - middle)[:, None, None]
-    # About the midpoint, where the large coefficients of both signs cancel.
-    here = metric_series(metric, variable(exact(middle), 2))
-    near = metric_series(metric, variable(angles, 2))
-    dual = here.derivative(0) + near.derivative(1) * gap
-    slope = here.derivative(1) + near.derivative(2) * gap
-    values, vectors = np.linalg.eigh(dual.midpoint)
-    if values.min() <= 0.0:
-        raise ValueError(f"W_bar is not positive definite for |theta| <= {angle}")
-    root = vectors / np.sqrt(values)[:, None, :]
-    relative = np.swapaxes(root, -1, -2) @ slope.midpoint @ root
-    found = float(np.abs(np.linalg.eigvalsh(relative)).max())
-    for room in (_ROOM, _ROOM**5, _ROOM**20):
-        bound = dual * (found * room)
-        if np.all(negative_definite(slope - bound) & negative_definite(-slope - bound)):
-            return found * room
-    raise ValueError(f"kappa={found:.3g} is not shown with cells={cells}: use more cells")
 
 
 def disturbed_rate(metric: Metric, drift: float, angle_disturbance: float) -> float:
@@ -118,46 +48,6 @@ def disturbed_rate(metric: Metric, drift: float, angle_disturbance: float) -> fl
     check_not_negative("drift", drift)
     check_not_negative("angle_disturbance", angle_disturbance)
     return metric.contraction_rate - 0.5 * drift * angle_disturbance
-
-
-def lipschitz_constant(system: CartPole, box: ProofBox, cells: int = 2000) -> Lipschitz:
-    """Bound the Lipschitz constant L_f of Lemma 1 on a box, soundly.
-
-    The Jacobian is affine in the push u_d - mu_c dp/dt, the rate and its square, and a norm is
-    convex: its corners decide, and intervals cover the angle between.
-
-    Args:
-        system: A cart-pole.
-        box: Where x, x_d and u_d lie; its errors do not matter. A lean is not supported.
-        cells: Equal intervals of the angle.
-
-    Raises:
-        TypeError: The system is no cart-pole.
-        ValueError: The box has a lean.
-    """
-    check_cartpole(system, "lipschitz_constant")
-    check_at_least("cells", cells, 1)
-    if box.lean:
-        raise ValueError(f"lean={box.lean!r} must be 0: state the force of the box instead")
-    start = time.monotonic()
-    ends = np.linspace(-box.angle, box.angle, cells + 1)
-    parts = jacobian_parts(system, accelerations(system, Interval(ends[:-1], ends[1:]), 1))
-    push = float((exact(box.velocity) * system.cart_friction + box.force).upper)
-    rate = box.angular_rate
-    upper = lower = growth = 0.0
-    zero = np.zeros((1, 1, 1))
-    for force in (-push, push):
-        for speed in (-rate, rate):
-            for square, real in ((0.0, rate == 0.0), (math.nextafter(rate * rate, math.inf), True)):
-                slope = parts.at(0, zero + force, zero, zero + speed, zero + square)
-                middle, reach = slope.midpoint, np.linalg.norm(slope.radius, axis=(-1, -2))
-                size = np.linalg.norm(middle, ord=2, axis=(-1, -2))
-                slack = reach + _ROUNDING * np.linalg.norm(middle, axis=(-1, -2))
-                upper = max(upper, float((size + slack).max()))
-                lower = max(lower, float((size - slack).max()) if real else 0.0)
-                symmetric = 0.5 * (middle + np.swapaxes(middle, -1, -2))
-                growth = max(growth, float((np.linalg.eigvalsh(symmetric)[:, -1] + slack).max()))
-    return Lipschitz(upper, lower, growth, time.monotonic() - start)
 
 
 def gain_residual(

@@ -20,77 +20,117 @@ and |c'e| <= sqrt(c'W c (1 - exp(-2 alpha t))): the ellipsoid V <= 1 is never le
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from lagros_envs.aliases import moved_names
 from lagros_envs.checks import check_fields, check_not_negative, check_positive
 from lagros_envs.dynamics import System, control_matrix, jacobian
-from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.contraction.cvstem import InfeasibleError
+from lagros_policies.contraction.regions import BoxRegion
 from lagros_policies.contraction.semidefinite import solve_conic, svec, symmetric_basis
-from lagros_policies.contraction.systems import check_cartpole
-from lagros_policies.proof.condition import ProofBox
 
+__getattr__ = moved_names(__name__)
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 Method = Literal["paper", "output", "ellipsoid"]
 
-# Angles of x at which the condition is imposed; it is even in the state, so half of them do.
-_ANGLES = 6
+# Points of a box at which the condition is imposed, and those that a held control begins with.
+_SAMPLES = 300
+_FIRST = 40
+_LEAST_ERROR = 1e-9
 # Rounds in which the errors that the tube allows, and those that the condition allows, meet.
 _ROUNDS = 40
 # The errors allowed exceed those of the tube by this share, so that the rounds end.
 _ROOM = 1.01
-# Far above the rounding of an eigenvalue of a 4 by 4 matrix whose condition is below 1e5.
+# Far above the rounding of an eigenvalue of a small matrix whose condition is below 1e5.
 _ROUNDING = 1e-9
 
 
+class Plans(Protocol):
+    """Where target trajectories lie: `PlanBounds`, or a set with a shape of its own."""
+
+    @property
+    def bounded(self) -> list[int]:
+        """Which coordinates of x are bounded; the others are free."""
+
+    def with_errors(self, error: FloatArray) -> Any:
+        """Return the box of x, x_d and u_d for errors of at most `error`, shape (n,)."""
+
+    def samples(self, system: System, error: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return J(y, u_d), shape (s, n, n), and B(x), (s, n, m), at points of that box."""
+
+    def held_samples(
+        self, system: System, error: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return the same for a control that is held, and which to begin with, shape (s,)."""
+
+
 @dataclass(frozen=True)
-class PlanBox:
-    """Where the target trajectory lies; the position is free.
+class PlanBounds:
+    """Target trajectories in a box.
 
     Attributes:
-        angle: Largest |theta_d| [rad].
-        velocity: Largest |dp_d/dt| [m/s].
-        angular_rate: Largest |dtheta_d/dt| [rad/s].
-        force: Largest |u_d| [N].
+        low: Least x_d, shape (n,); infinite where the motion does not depend on it.
+        high: Largest x_d.
+        control_low: Least u_d, shape (m,).
+        control_high: Largest u_d.
 
     Raises:
-        ValueError: A bound is negative or not finite.
+        ValueError: A lower bound is not below its upper bound.
     """
 
-    angle: float = 0.1
-    velocity: float = 1.0
-    angular_rate: float = 0.2
-    force: float = 1.0
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    control_low: tuple[float, ...]
+    control_high: tuple[float, ...]
 
     def __post_init__(self) -> None:
         """Check the bounds."""
-        check_fields(self)
-        for item in fields(self):
-            check_not_negative(item.name, getattr(self, item.name))
+        self.with_errors(np.ones(len(self.low)))
 
-    def with_errors(self, error: FloatArray) -> ProofBox:
-        """Return the box of x and x_d for errors of at most `error`, shape (4,).
+    @property
+    def bounded(self) -> list[int]:
+        """Which coordinates of x are bounded."""
+        return [int(index) for index in np.flatnonzero(np.isfinite(self.low))]
 
-        Raises:
-            ValueError: The errors are not four finite numbers >= 0, or the angle reaches pi/2.
-        """
-        values = np.asarray(error, dtype=np.float64)
-        if values.shape != (4,) or not np.all(np.isfinite(values) & (values >= 0.0)):
-            raise ValueError(f"error={values.tolist()!r} must be four finite numbers >= 0")
-        return ProofBox(
-            angle=self.angle + float(error[ANGLE]),
-            velocity=self.velocity + float(error[VELOCITY]),
-            angular_rate=self.angular_rate + float(error[ANGULAR_RATE]),
-            force=self.force,
-            angle_error=float(error[ANGLE]),
-            angular_rate_error=float(error[ANGULAR_RATE]),
-        )
+    def with_errors(self, error: FloatArray) -> BoxRegion:
+        """Return the box of x, x_d and u_d for errors of at most `error`, shape (n,)."""
+        some = np.maximum(error, _LEAST_ERROR)
+        low, high = np.array(self.low) - some, np.array(self.high) + some
+        ends = [tuple(end.tolist()) for end in (low, high, some)]
+        return BoxRegion(ends[0], ends[1], ends[2], self.control_low, self.control_high)
+
+    def samples(self, system: System, error: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return J(y, u_d), shape (s, n, n), and B(x), (s, n, m), at random corners and middles."""
+        box, rng = self.with_errors(error), np.random.default_rng(0)
+
+        def drawn(low: Sequence[float], high: Sequence[float]) -> FloatArray:
+            ends = np.array([low, high])
+            ends = np.where(np.isfinite(ends), ends, 0.0)
+            three = np.stack([ends[0], ends.mean(axis=0), ends[1]])
+            return np.take_along_axis(three, rng.integers(0, 3, (_SAMPLES, len(low))), axis=0)
+
+        y, control = drawn(box.low, box.high), drawn(box.control_low, box.control_high)
+        x = np.clip(y + rng.choice([-1.0, 0.0, 1.0], y.shape) * np.array(box.error), *_finite(box))
+        return jacobian(system, y, control)[0], control_matrix(system, x)
+
+    def held_samples(
+        self, system: System, error: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return `samples`, and the first of them to begin with."""
+        slope, gain = self.samples(system, error)
+        return slope, gain, np.arange(len(slope)) < _FIRST
+
+
+def _finite(box: BoxRegion) -> tuple[FloatArray, FloatArray]:
+    low, high = np.array(box.low), np.array(box.high)
+    return np.where(np.isfinite(low), low, 0.0), np.where(np.isfinite(high), high, 0.0)
 
 
 @dataclass(frozen=True)
@@ -146,16 +186,16 @@ class ConstantTube:
 
     Attributes:
         design: What it was designed for.
-        dual: W, shape (4, 4). For the ellipsoid V = e'W^-1 e <= 1 is the tube; else I <= W.
+        dual: W, shape (n, n). For the ellipsoid V = e'W^-1 e <= 1 is the tube; else I <= W.
         control_weight: nu.
-        plan: Where the target trajectories lie.
-        error: Errors for which the condition was imposed, shape (4,).
+        plan: Where the target trajectories lie, some `Plans`.
+        error: Errors for which the condition was imposed, shape (n,).
     """
 
     design: TubeDesign
     dual: FloatArray
     control_weight: float
-    plan: PlanBox
+    plan: Any
     error: FloatArray
 
     @property
@@ -178,17 +218,14 @@ class ConstantTube:
 
     @property
     def steady_outputs(self) -> FloatArray:
-        """The bounds of each |e_i| as time goes on, shape (4,)."""
+        """The bounds of each |e_i| as time goes on, shape (n,)."""
         bounds: FloatArray = np.sqrt(self.energy * np.diag(self.dual)) * (1.0 + _ROUNDING)
         return bounds
 
     @property
     def contained(self) -> bool:
-        """Whether the tube stays where the condition was imposed, without which it proves nothing.
-
-        The position is free.
-        """
-        places = [ANGLE, VELOCITY, ANGULAR_RATE]
+        """Whether the tube stays where its condition was imposed, without which it is none."""
+        places = self.plan.bounded
         return bool(np.all(self.steady_outputs[places] <= self.error[places]))
 
     @property
@@ -196,12 +233,12 @@ class ConstantTube:
         """The largest w_bar for which the tube is contained; for the ellipsoid its own or zero."""
         if self.design.method == "ellipsoid":
             return self.design.disturbance_bound if self.contained else 0.0
-        places = [ANGLE, VELOCITY, ANGULAR_RATE]
+        places = self.plan.bounded
         room = float(np.min(self.error[places] / self.steady_outputs[places]))
         return room * self.design.disturbance_bound
 
     @property
-    def proof_box(self) -> ProofBox:
+    def proof_box(self) -> Any:
         """The box of x, x_d and u_d on which the condition is asked for."""
         return self.plan.with_errors(self.error)
 
@@ -213,32 +250,31 @@ class ConstantTube:
         return -np.expm1(-rate * np.asarray(time, dtype=np.float64))
 
     def output_radius(self, direction: FloatArray, time: Any) -> Any:
-        """Return the bound of |c'e(t)| for c of shape (4,) at times t [s] after e(0) = 0."""
+        """Return the bound of |c'e(t)| for c of shape (n,) at times t [s] after e(0) = 0."""
         return math.sqrt(self.energy * float(direction @ self.dual @ direction)) * self.share(time)
 
 
 def design_constant(
-    system: System, plan: PlanBox, error: FloatArray, design: TubeDesign
+    system: System, plan: Plans, error: FloatArray, design: TubeDesign
 ) -> ConstantTube:
     """Solve one of the three programs on samples of a box (not yet proved).
 
     Args:
-        system: A cart-pole.
+        system: The system.
         plan: Where the target trajectories lie.
-        error: Largest |x - x_d|, shape (4,); that of the position does not matter.
+        error: Largest |x - x_d|, shape (n,).
         design: What to design.
 
     Returns:
         The tube.
 
     Raises:
-        TypeError: The system is no cart-pole.
+        TypeError: The system is not that of the plans.
         InfeasibleError: There is no such constant metric.
         RuntimeError: The solver stopped for another reason.
-        ValueError: The box reaches pi/2.
+        ValueError: There is no such box.
     """
-    check_cartpole(system, "design_constant")
-    slope, gain = _samples(system, plan.with_errors(error))
+    slope, gain = plan.samples(system, error)
     dual, weight, status = _solve(slope, gain, design)
     if dual is None:
         if "Infeasible" in status:
@@ -255,7 +291,7 @@ class TubeInBox(Protocol):
 
     @property
     def steady_outputs(self) -> FloatArray:
-        """Bound of each |e_i|, shape (4,)."""
+        """Bound of each |e_i|, shape (n,)."""
 
     @property
     def contained(self) -> bool:
@@ -265,11 +301,11 @@ class TubeInBox(Protocol):
 Contained = TypeVar("Contained", bound=TubeInBox)
 
 
-def design_contained(system: System, plan: PlanBox, design: TubeDesign) -> ConstantTube:
+def design_contained(system: System, plan: Plans, design: TubeDesign) -> ConstantTube:
     """Design a tube on the errors that it allows itself: from none, until both meet.
 
     Args:
-        system: A cart-pole.
+        system: The system.
         plan: Where the target trajectories lie.
         design: What to design.
 
@@ -283,16 +319,20 @@ def design_contained(system: System, plan: PlanBox, design: TubeDesign) -> Const
     return self_contained(
         lambda error: design_constant(system, plan, error, design),
         f"disturbance_bound={design.disturbance_bound} around {plan}",
+        system.state_dim,
     )
 
 
-def self_contained(design_for: Callable[[FloatArray], Contained], what: str) -> Contained:
+def self_contained(
+    design_for: Callable[[FloatArray], Contained], what: str, states: int
+) -> Contained:
     """Design a tube again and again, each time on the errors that the last one allows.
 
     Args:
-        design_for: Gives the tube for errors (4,) up to which its condition is to hold; ValueError
+        design_for: Gives the tube for errors (n,) up to which its condition is to hold; ValueError
             (so InfeasibleError) where there is none.
         what: What the tube is for, to be said where there is none.
+        states: Number n of states.
 
     Returns:
         The first tube that is contained in the box of its condition.
@@ -301,7 +341,7 @@ def self_contained(design_for: Callable[[FloatArray], Contained], what: str) -> 
         InfeasibleError: The errors outgrow the box on which there is a tube.
         RuntimeError: The two did not meet.
     """
-    error = np.zeros(4)
+    error = np.zeros(states)
     for _ in range(_ROUNDS):
         try:
             tube = design_for(error)
@@ -311,25 +351,6 @@ def self_contained(design_for: Callable[[FloatArray], Contained], what: str) -> 
             return tube
         error = np.maximum(error, _ROOM * tube.steady_outputs)
     raise RuntimeError(f"the errors still grow after {_ROUNDS} rounds for {what}")
-
-
-def _samples(system: System, box: ProofBox) -> tuple[FloatArray, FloatArray]:
-    """Return Jacobians at y, (s, 4, 4), and B at x, (s, 4, 1), at corners of the box."""
-    angles = np.linspace(0.0, box.angle, _ANGLES)
-    gaps = np.array([-1.0, 0.0, 1.0]) * box.angle_error
-    signs = np.array([-1.0, 1.0])
-    # Friction makes a velocity act like a force: the two are extreme together.
-    angle, gap, rate, drive = (
-        part.ravel() for part in np.meshgrid(angles, gaps, signs, signs, indexing="ij")
-    )
-    x = np.zeros((len(angle), 4))
-    x[:, ANGLE] = angle
-    y = np.zeros_like(x)
-    y[:, ANGLE] = np.clip(angle + gap, -box.angle, box.angle)
-    y[:, ANGULAR_RATE] = rate * box.angular_rate
-    y[:, VELOCITY] = -drive * box.velocity
-    slope, _ = jacobian(system, y, drive[:, None] * box.force)
-    return slope, control_matrix(system, x)
 
 
 def _solve(

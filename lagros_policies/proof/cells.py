@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
@@ -97,11 +98,12 @@ def search(
     start, begun = time.monotonic(), time.thread_time()
     waiting = condition.start()
     seen = 0
+    whole = np.ptp(np.concatenate([waiting.lower, waiting.upper]), axis=0)
     while len(waiting.lower):
         # The newest first: depth first finds a failure soon and keeps the list short.
         some, rest = waiting[-batch:], waiting[:-batch]
         seen += len(some.lower)
-        left, effects = _examined(condition, some)
+        left, effects = _examined(condition, some, whole)
         some, effects = some[left], effects[left]
         failure = _failed(condition, some)
         if failure is not None:
@@ -116,13 +118,16 @@ def search(
     return Search(True, seen, time.monotonic() - start)
 
 
-def _examined(condition: Condition[Failure], cells: Interval) -> tuple[BoolArray, FloatArray]:
+def _examined(
+    condition: Condition[Failure], cells: Interval, whole: FloatArray
+) -> tuple[BoolArray, FloatArray]:
     """Return which cells (k,) are not proved, and how much each coordinate matters, (k, c)."""
     try:
         found = condition.examine(cells)
     except ZeroDivisionError:
         # Some cell is too wide for its intervals: halve them all where they are widest.
-        return np.ones(len(cells.lower), dtype=bool), cells.upper - cells.lower
+        width = (cells.upper - cells.lower) / np.where(whole > 0.0, whole, 1.0)
+        return np.ones(len(cells.lower), dtype=bool), width
     added = [part[:, None] for part in found.remainders]
     definite = np.all(negative_definite(found.corners, added), axis=-1)
     return ~(found.empty | definite), _sizes(found)
@@ -147,10 +152,14 @@ def grid(lower: FloatArray, upper: FloatArray, counts: tuple[int, ...]) -> Inter
     Returns:
         The cells, shape (product of the counts, c).
     """
-    cuts = [np.linspace(a, b, n + 1) for a, b, n in zip(lower, upper, counts, strict=True)]
+    return mesh([np.linspace(a, b, n + 1) for a, b, n in zip(lower, upper, counts, strict=True)])
+
+
+def mesh(cuts: Sequence[FloatArray]) -> Interval:
+    """Return the cells between cuts of each coordinate, shape (product of their numbers, c)."""
     low = np.stack(np.meshgrid(*[cut[:-1] for cut in cuts], indexing="ij"), axis=-1)
     high = np.stack(np.meshgrid(*[cut[1:] for cut in cuts], indexing="ij"), axis=-1)
-    return Interval(low.reshape(-1, len(counts)), high.reshape(-1, len(counts)))
+    return Interval(low.reshape(-1, len(cuts)), high.reshape(-1, len(cuts)))
 
 
 def remainder(second: Interval, width: FloatArray) -> Interval:

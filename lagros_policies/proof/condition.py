@@ -1,60 +1,69 @@
-"""Proof of the contraction condition on continuous boxes, by interval arithmetic and bisection.
+"""Proof of the contraction condition on continuous sets, by interval arithmetic and bisection.
 
 Theorem 2 asks, with A = A(x, x_d, u_d) of `state_dependent_coefficient`, for
 
-    -dW_bar/dt(x) + 2 sym(A W_bar(x)) - 2 nu B(x) B(x)' + 2 alpha W_bar(x) < 0.             (*)
+    -dW_bar/dt + 2 sym(A W_bar) - 2 nu B(x) B(x)' + 2 alpha W_bar < 0,                       (*)
 
-A is the mean of J(y, u_d) = d(f + B u_d)/dx(y) over the segment from x_d to x, and (*) is affine in
-A. So it is enough, and this is what is proved, that for every x of the box, every point y of the
-box whose angle and rate differ from those of x by the errors allowed, and every force of the box
+with W_bar at x, or at x_d. A is the mean of J(y, u_d) = d(f + B u_d)/dx(y) over the segment from
+x_d to x, and (*) is affine in A. So it is enough, and this is what is proved, that for every x and
+x_d of a box, every point y of the box that differs from them by no more than the errors allowed,
+and every u_d
 
-    -dW_bar/dt(x) + 2 sym(J(y, u_d) W_bar(x)) - 2 nu B(x) B(x)' + 2 alpha W_bar(x) < 0.    (**)
+    -dW_bar/dt + 2 sym(J(y, u_d) W_bar) - 2 nu B(x) B(x)' + 2 alpha W_bar < 0.              (**)
 
-The box is convex, so y runs over the whole segment and (*) follows by averaging, for a W_bar that
-depends on the angle too. With `ProofBox.apart` x and x_d lie anywhere in the box. With errors of
-zero, y is x and (**) is the differential condition (of infinitesimal displacements); for a W_bar
+The box is convex, so y runs over the whole segment and (*) follows by averaging. With errors of
+zero y is x and (**) is the differential condition (of infinitesimal displacements); for a W_bar
 that depends on x that alone does not imply (*).
 
 Proved is the condition on the derivative, for the coefficients of the motion as the doubles that
-the code computes with. It says nothing of the hold of the control between its instants (see
-`hold`), nor of the term by which a disturbance moves W_bar.
+the code computes with. It says nothing of the hold of the control between its instants (for that
+there is `prove_hold`), nor of the term by which a disturbance moves W_bar.
 """
 
 from __future__ import annotations
 
-import math
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from lagros_envs.checks import check_at_least, check_positive
 from lagros_envs.dynamics import System
-from lagros_envs.numbers import Interval, exact, variable
-from lagros_envs.tasks.cartpole.physics import ANGLE
 from lagros_policies.contraction.metric import Metric
-from lagros_policies.contraction.systems import check_cartpole, check_cartpole_metric
-from lagros_policies.proof.box import ProofBox
-from lagros_policies.proof.cells import search
-from lagros_policies.proof.matrices import interval_jacobian, negative_definite
-from lagros_policies.proof.motion import metric_series
-from lagros_policies.proof.rates import Violation, rate_condition
+from lagros_policies.contraction.regions import BoxRegion
+from lagros_policies.contraction.statement import Statement, at_most
+from lagros_policies.contraction.systems import check_polynomial, check_sizes
+from lagros_policies.proof.bounds import ProvedBounds, metric_bounds, prove_bounds
+from lagros_policies.proof.cells import Search, search
+from lagros_policies.proof.families import (
+    BoxCondition,
+    Violation,
+    held_ends,
+    hold_matrices,
+    rate_matrices,
+)
+from lagros_policies.proof.sets import Provable, held_triples, triples
 
 __all__ = [
     "ContractionProof",
-    "ProofBox",
-    "ProvedBounds",
+    "HoldProof",
+    "Proof",
     "Violation",
     "largest_proved",
-    "prove_bounds",
+    "prove",
     "prove_contraction",
+    "prove_hold",
 ]
 
 FloatArray = NDArray[np.float64]
 
 # Cells of one pass: enough to hide NumPy's cost per call, few enough to stay in the cache.
-_BATCH = 300
+_BATCH = 100
+_HELD_BATCH = 400
+# Cells along each coordinate that enclose where a hold ends.
+_CELLS = 6
 
 
 @dataclass(frozen=True)
@@ -68,11 +77,11 @@ class ContractionProof:
         boxes: Cells examined.
         seconds: Time taken [s].
         violation: A point where the condition fails, or None.
-        undecided: One cell left undecided, ends (2, 3) of the angle of x, of that of y (less that
-            of x if the errors are bounded) and the rate of y; None if proved or violated.
+        undecided: One cell left undecided, ends (2, c) of the coordinates that matter; None if
+            proved or violated.
     """
 
-    box: ProofBox
+    box: BoxRegion | Provable
     contraction_rate: float
     proved: bool
     boxes: int
@@ -82,33 +91,49 @@ class ContractionProof:
 
 
 @dataclass(frozen=True)
-class ProvedBounds:
-    """Bounds that hold for every |theta| <= angle.
+class HoldProof:
+    """What the search for a proof over a hold came to.
 
     Attributes:
-        angle: Largest |theta| [rad].
-        least: least I <= S W_bar S.
-        largest: S W_bar S <= largest I.
-        control_gain: b_bar, bound of ||B(x)||.
+        search: Of the condition on the set.
+        ends: Between what coordinates of x lie at the end of a hold: those of the metric, and those
+            that were asked for.
+        definite: Whether W_bar is positive definite wherever it ends.
         seconds: Time taken [s].
     """
 
-    angle: float
-    least: float
-    largest: float
-    control_gain: float
-    seconds: float = 0.0
+    search: Search[Violation]
+    ends: Mapping[int, tuple[float, float]]
+    definite: bool
+    seconds: float
 
     @property
-    def condition(self) -> float:
-        """A bound of chi, the condition number in the units of the scaling S."""
-        return math.nextafter(self.largest / self.least, math.inf)
+    def proved(self) -> bool:
+        """Whether the sampled loop contracts, for infinitesimal errors."""
+        return self.search.proved and self.definite
+
+
+@dataclass(frozen=True)
+class Proof:
+    """The proofs behind statements.
+
+    Attributes:
+        statements: What was claimed, and whether it was proved.
+        contraction: Theorem 2's condition on the box.
+        bounds: Bounds of W_bar and B on the box; None if W_bar is not positive definite on it.
+        held: The condition over a hold; None if it was not asked for.
+    """
+
+    statements: list[Statement]
+    contraction: ContractionProof
+    bounds: ProvedBounds | None
+    held: HoldProof | None = None
 
 
 def prove_contraction(
     system: System,
     metric: Metric,
-    box: ProofBox,
+    box: BoxRegion | Provable,
     contraction_rate: float | None = None,
     *,
     most_boxes: int = 1_000_000,
@@ -117,8 +142,8 @@ def prove_contraction(
     """Prove the condition of Theorem 2, equation (14), on a box, or find where it fails.
 
     Args:
-        system: A cart-pole.
-        metric: The metric.
+        system: The system.
+        metric: The metric; one of x only where no control moves it.
         box: Where to prove it.
         contraction_rate: alpha [1/s]; None for that of the metric.
         most_boxes: Cells after which the search gives up.
@@ -128,22 +153,27 @@ def prove_contraction(
         The proof, or why there is none.
 
     Raises:
-        TypeError: The system is no cart-pole, whose structure the proof uses, or the metric no
-            polynomial.
+        TypeError: The metric is no polynomial, or the box of another system.
+        ValueError: Metric, box and system do not fit each other, a control moves the metric, or
+            what matters is not bounded.
     """
-    cartpole = check_cartpole(system, "prove_contraction")
-    check_cartpole_metric(metric, "prove_contraction")
+    check_polynomial(metric, "prove_contraction")
     rate = metric.contraction_rate if contraction_rate is None else contraction_rate
-    found = search(rate_condition(cartpole, metric, box, rate), _BATCH, most_boxes, most_seconds)
+    start = time.monotonic()
+    where = triples(box, system, metric.point)
+    check_sizes(system, scaling=(metric.scaling, (system.state_dim,)))
+    condition = BoxCondition(where, rate_matrices(system, metric, rate))
+    found = search(condition, _BATCH, most_boxes, most_seconds)
+    spent = time.monotonic() - start
     return ContractionProof(
-        box, rate, found.proved, found.cells, found.seconds, found.failure, found.undecided
+        box, rate, found.proved, found.cells, spent, found.failure, found.undecided
     )
 
 
 def largest_proved(
     system: System,
     metric: Metric,
-    box: ProofBox,
+    box: Any,
     contraction_rate: float | None = None,
     *,
     rounds: int = 8,
@@ -152,9 +182,9 @@ def largest_proved(
     """Find the largest multiple, at most one, of a box on which the condition can be proved.
 
     Args:
-        system: A cart-pole.
+        system: The system.
         metric: The metric.
-        box: The shape, and the largest size, of the box.
+        box: The shape, and the largest size, of the box; `box.scaled(factor)` is a multiple.
         contraction_rate: alpha [1/s]; None for that of the metric.
         rounds: Halvings of the range of the multiple.
         most_seconds: Processor time for all of it [s]; each attempt gets an equal share.
@@ -178,55 +208,149 @@ def largest_proved(
     return best
 
 
-def prove_bounds(system: System, metric: Metric, angle: float, cells: int = 2000) -> ProvedBounds:
-    """Enclose the eigenvalues of S W_bar S and the norm of B for every |theta| <= angle.
+def prove_hold(
+    system: System,
+    metric: Metric,
+    box: BoxRegion | Provable,
+    contraction_rate: float | None = None,
+    period: float = 0.1,
+    *,
+    counts: Sequence[int] = (),
+    also: Sequence[int] = (),
+    most_seconds: float = 60.0,
+) -> HoldProof:
+    """Prove the condition over a hold of the control, see `families.hold_matrices`.
 
     Args:
-        system: A cart-pole.
+        system: The system.
         metric: The metric.
-        angle: Largest |theta| [rad].
-        cells: Equal intervals of the angle.
-
-    Returns:
-        The bounds.
+        box: Where x = x_d and u_d lie; its errors are not used.
+        contraction_rate: alpha [1/s]; None for that of the metric.
+        period: Hold [s].
+        counts: Cells along each coordinate of the set, for where a hold ends; () for six.
+        also: Coordinates whose ends are asked for besides those of the metric.
+        most_seconds: Processor time after which the search gives up [s].
 
     Raises:
-        TypeError: The system is no cart-pole: B of another may depend on more than the angle.
-        ValueError: W_bar cannot be shown to be positive definite with so many cells.
+        TypeError: The metric is no polynomial, or the box of another system.
+        ValueError: Metric, box and system do not fit each other, or what matters is not bounded.
     """
-    check_cartpole(system, "prove_bounds")
-    check_cartpole_metric(metric, "prove_bounds")
-    check_positive("angle", angle)
-    check_at_least("cells", cells, 1)
+    check_polynomial(metric, "prove_hold")
     start = time.monotonic()
-    ends = np.linspace(-angle, angle, cells + 1)
-    thetas = Interval(ends[:-1], ends[1:])
-    scale = metric.scaling[:, None] * metric.scaling[None, :]
-    # About the midpoint: W_bar(c) + W_bar'(cell) (theta - c). S_i S_j rounds; as an interval it is
-    # enclosed.
-    middle = thetas.midpoint
-    gap = (thetas - middle)[:, None, None]
-    dual = metric_series(metric, variable(exact(middle), 1)).derivative(0)
-    dual = dual + metric_series(metric, variable(thetas, 1)).derivative(1) * gap
-    scaled = dual * exact(metric.scaling[:, None]) * metric.scaling[None, :]
-    values = np.linalg.eigvalsh(scaled.midpoint)
-    # Weyl: the eigenvalues move by no more than the largest row sum of the radii.
-    slack = float(scaled.radius.sum(axis=-1).max()) + 1e-9 * float(np.abs(scale).max())
-    least, largest = float(values.min()) - slack, float(values.max()) + slack
-    identity = np.eye(len(metric.scaling))
-    proved = negative_definite(scaled - largest * identity) & negative_definite(
-        least * identity - scaled
+    rate = metric.contraction_rate if contraction_rate is None else contraction_rate
+    where = held_triples(box, system)
+    check_sizes(system, scaling=(metric.scaling, (system.state_dim,)))
+    condition = BoxCondition(where, hold_matrices(system, metric, rate, period, where))
+    found = search(condition, _HELD_BATCH, 1_000_000, most_seconds)
+    begun, ended = held_ends(system, where, period, counts or [_CELLS] * len(where.lower))
+    low, high = np.full((2, system.state_dim), [[-np.inf], [np.inf]])
+    for index in metric.coordinates:
+        both = begun[index], ended[index]
+        low[index] = min(part.lower.min() for part in both)
+        high[index] = max(part.upper.max() for part in both)
+    try:
+        metric_bounds(metric, low, high)
+        definite = True
+    except ValueError:
+        definite = False
+    reached = {
+        index: (float(ended[index].lower.min()), float(ended[index].upper.max()))
+        for index in sorted({*metric.coordinates, *also})
+    }
+    return HoldProof(found, reached, definite, time.monotonic() - start)
+
+
+def prove(
+    system: System,
+    metric: Metric,
+    box: BoxRegion,
+    contraction_rate: float | None = None,
+    *,
+    period: float | None = None,
+    most_seconds: float = 60.0,
+) -> Proof:
+    """Prove what can be proved of a metric on a box, as statements.
+
+    Args:
+        system: The system.
+        metric: The metric; one of x only where no control moves it.
+        box: Where x and x_d lie, how far apart they are, and where u_d lies.
+        contraction_rate: alpha [1/s]; None for that of the metric.
+        period: Hold over which its condition is to be proved too [s]; None to leave it out.
+        most_seconds: Processor time after which each search gives up [s].
+
+    Returns:
+        The statements, all of kind "proved", with the proofs behind them. One that was not proved
+        within the time does not hold.
+
+    Raises:
+        TypeError: The metric is no polynomial.
+        ValueError: As for `prove_contraction`.
+    """
+    where = describe(box)
+    proof = prove_contraction(system, metric, box, contraction_rate, most_seconds=most_seconds)
+    bounds, line = bounds_statement(system, metric, box.low, box.high, where)
+    lines = [contraction_statement(proof, metric, where), line]
+    held = None
+    if period is not None:
+        held = prove_hold(system, metric, box, contraction_rate, period, most_seconds=most_seconds)
+        lines.append(held_statement(held, proof.contraction_rate, period, where, "in it"))
+    return Proof(lines, proof, bounds, held)
+
+
+def contraction_statement(proof: ContractionProof, metric: Metric, where: str) -> Statement:
+    """Return Theorem 2's condition as a line of a certificate, for a set in words."""
+    return Statement(
+        f"-dW/dt + 2 sym(A W) - 2 nu B B' < -2 alpha W, equation (14), with alpha = "
+        f"{proof.contraction_rate:g} 1/s and nu = {metric.control_weight:.6g} (W as in its "
+        f"file) for {where}",
+        "proved",
+        proof.proved,
+        proof.seconds,
+        refuted=proof.violation is not None,
     )
-    if least <= 0.0 or not np.all(proved):
-        raise ValueError(
-            f"W_bar is not shown to be positive definite for |theta| <= {angle} with "
-            f"cells={cells}: use more cells, or another metric"
-        )
-    states = np.zeros((cells, system.state_dim))
-    low, high = states.copy(), states.copy()
-    low[:, ANGLE], high[:, ANGLE] = thetas.lower, thetas.upper
-    gain = interval_jacobian(system, Interval(low, high), exact([0.0] * system.control_dim))[1]
-    # The Frobenius norm bounds the spectral norm, and is it for one control.
-    squares = np.maximum(np.abs(gain.lower), np.abs(gain.upper)) ** 2
-    norm = math.sqrt(float(squares.sum(axis=(-1, -2)).max())) * (1.0 + 1e-12)
-    return ProvedBounds(angle, least, largest, norm, time.monotonic() - start)
+
+
+def held_statement(
+    proof: HoldProof, rate: float, period: float, where: str, ends: str
+) -> Statement:
+    """Return the condition over a hold as a line of a certificate, for sets in words."""
+    return Statement(
+        f"under a force held for {period:g} s, some force shrinks an infinitesimal error by "
+        f"exp(-alpha {period:g} s) in the metric from one control instant to the next, with "
+        f"alpha = {rate:g} 1/s, for {where}; W is positive definite wherever the hold ends, {ends}",
+        "proved",
+        proof.proved,
+        proof.seconds,
+        refuted=proof.search.failure is not None,
+    )
+
+
+def bounds_statement(
+    system: System, metric: Metric, low: ArrayLike, high: ArrayLike, where: str
+) -> tuple[ProvedBounds | None, Statement]:
+    """Prove I <= S W_bar S <= chi I, with the metric's own chi, and b_bar on a box of states."""
+    start = time.monotonic()
+    claim = f"I <= S W S <= chi I with chi = {at_most(metric.condition_bound, 6)} "
+    try:
+        bounds = prove_bounds(system, metric, low, high)
+    except ValueError:
+        spent = time.monotonic() - start
+        return None, Statement(f"{claim}for {where}", "proved", False, spent)
+    holds = bounds.least >= 1.0 and bounds.largest <= metric.condition_bound
+    text = f"{claim}and ||B|| <= b_bar = {at_most(bounds.control_gain, 6)} for {where}"
+    return bounds, Statement(text, "proved", holds, bounds.seconds)
+
+
+def describe(box: BoxRegion) -> str:
+    """Return a box in words."""
+    entries = [
+        f"{low:g} <= x[{index}] <= {high:g}"
+        for index, (low, high) in enumerate(zip(box.low, box.high, strict=True))
+    ]
+    entries += [
+        f"{low:g} <= u_d[{index}] <= {high:g}"
+        for index, (low, high) in enumerate(zip(box.control_low, box.control_high, strict=True))
+    ]
+    errors = ", ".join(f"{value:g}" for value in box.error)
+    return f"every {', '.join(entries)}, x_d in the same box with |x - x_d| up to ({errors})"

@@ -35,7 +35,7 @@ from lagros_envs.tasks.cartpole.physics import VELOCITY
 from lagros_policies.contraction.control import HeldControl
 from lagros_policies.contraction.metric import matrices_at, region_angle
 from lagros_policies.contraction.places import at_angles
-from lagros_policies.contraction.systems import check_cartpole
+from lagros_policies.tasks.cartpole.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]
 # (x (..., n), u (..., 1)) -> Y (..., k) [N per unit of a].

@@ -32,6 +32,7 @@ _MOVED = {
     "contraction.proof.spacecraft": "tasks.spacecraft.proof",
     "contraction.proof.design": "tasks.cartpole.proof_design",
     "contraction.proof.program": "tasks.cartpole.proof_program",
+    "contraction.proof.box": "tasks.cartpole.box",
     "contraction.proof": "proof",
     "contraction.adaptive": "remarks.adaptive",
     "contraction.lagrangian": "remarks.lagrangian",
@@ -47,10 +48,18 @@ _MOVED = {
     "export.spacecraft_onnx": "tasks.spacecraft.onnx",
 }
 MOVED = {f"lagros_policies.{old}": f"lagros_policies.{new}" for old, new in _MOVED.items()}
+_CARTPOLE = "lagros_policies.tasks.cartpole"
 # As in `lagros_envs.tasks.moved`.
 NAMES = {
     "lagros_policies.contraction.feedback": "lagros_policies.tasks.cartpole.feedback",
     "lagros_policies.policy": {"SPACECRAFT_NAMES": "lagros_policies.tasks.spacecraft"},
     "lagros_policies.expert": "lagros_policies.tasks.cartpole.expert",
     "lagros_policies.safety": "lagros_policies.tasks.spacecraft.safety_filter",
+    "lagros_policies.contraction.tube_design": {"PlanBox": f"{_CARTPOLE}.plans"},
+    "lagros_policies.contraction.held_ellipsoid": {"held_statement": f"{_CARTPOLE}.certificate"},
+    "lagros_policies.contraction.theorems": {
+        "lipschitz_constant": f"{_CARTPOLE}.lipschitz",
+        "Lipschitz": f"{_CARTPOLE}.lipschitz",
+        "metric_drift": "lagros_policies.proof.bounds",
+    },
 }

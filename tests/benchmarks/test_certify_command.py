@@ -20,7 +20,7 @@ from lagros_policies.contraction import load_metric, save_metric
 from lagros_policies.contraction.certificate import Certificate, TubeSizes
 from lagros_policies.contraction.metric_files import metric_record
 from lagros_policies.contraction.statement import Statement
-from lagros_policies.proof.box import ProofBox
+from lagros_policies.tasks.cartpole.box import ProofBox
 from lagros_policies.tasks.spacecraft.ellipsoid_axis import AxisEllipsoid, prove_axis_ellipsoid
 
 

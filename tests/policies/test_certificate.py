@@ -12,7 +12,7 @@ from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.contraction import Region, load_metric
 from lagros_policies.contraction.double_integrator import design_axis
 from lagros_policies.contraction.statement import Statement
-from lagros_policies.proof.box import ProofBox
+from lagros_policies.tasks.cartpole.box import ProofBox
 from lagros_policies.tasks.cartpole.certificate import (
     CartPoleQuestion,
     cartpole_certificate,

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.interpolate import BPoly
 
-from lagros_envs.numbers import exact
 from lagros_policies.contraction import held_ellipsoid, load_metric
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.held_design import (
@@ -17,18 +16,17 @@ from lagros_policies.contraction.held_design import (
 )
 from lagros_policies.contraction.held_ellipsoid import (
     _falls_at_instants,
-    held_statement,
     prove_held_tube,
 )
 from lagros_policies.contraction.statement import at_most
-from lagros_policies.contraction.tube_design import PlanBox
-from lagros_policies.proof.box import ProofBox
-from lagros_policies.proof.cells import Search, grid
-from lagros_policies.proof.lifted import LiftedCondition
+from lagros_policies.proof.cells import Search
+from lagros_policies.tasks.cartpole.box import ProofBox
 from lagros_policies.tasks.cartpole.certificate import (
     CartPoleQuestion,
     cartpole_certificate,
+    held_statement,
 )
+from lagros_policies.tasks.cartpole.plans import PlanBox
 
 PLAN = PlanBox(angle=0.05, velocity=0.3, angular_rate=0.1, force=0.3)
 BOUND, PERIOD = 0.1, 0.1
@@ -214,87 +212,14 @@ def test_shorter_holds_stay_inside_an_aperiodic_tube(tube, oracle):
             assert np.all(energy <= tube.share(time) ** 2 * (1 + 1e-6))
 
 
-def test_the_lifted_condition_encloses_what_it_speaks_of(system, oracle):
-    """Inside a cell, against the matrix of the oracle's Jacobian: interpolation and remainder."""
-    box = ProofBox(0.4, 1.0, 1.5, 2.0, angle_error=0.3, angular_rate_error=0.5)
-    dual = np.cov(np.random.default_rng(6).standard_normal((5, 12)))
-    condition = LiftedCondition(system, box, dual, exact(np.zeros((5, 5))))
-    cells = condition.start()
-    found = condition.examine(cells)
-    corners = found.corners.midpoint.reshape(len(cells.lower), 8, 4, 5, 5)
-    reach = sum(np.maximum(np.abs(part.lower), np.abs(part.upper)) for part in found.remainders)
-    rng = np.random.default_rng(7)
-    bent = 0.0
-    for cell in rng.integers(0, len(cells.lower), 60):
-        first, second = rng.uniform(0, 1, 2)
-        low, width = cells.lower[cell], (cells.upper - cells.lower)[cell]
-        x, y = np.zeros(4), np.zeros(4)
-        x[1], y[1] = low + np.array([first, second]) * width
-        # Corners of what the matrix is affine in: -f or f; w, -w, then what is off the parabola.
-        push, turn = rng.integers(0, 2, 2)
-        y[2:] = (1 - 2 * push) * box.velocity, (1 - 2 * turn) * box.angular_rate
-        lifted = np.zeros((5, 5))
-        control = np.array([(2 * push - 1) * box.force])
-        lifted[:4, :4] = oracle.jacobian(lambda at, u=control: oracle.rates(at, u), y)
-        lifted[:4, 4:] = oracle.input_matrix(x)
-        weights = np.outer([1 - first, first], [1 - second, second]).ravel()
-        drawn = np.tensordot(weights, corners[cell, 4 * push + turn], axes=1)
-        gap = np.abs(lifted @ dual + dual @ lifted.T - drawn)
-        # The range of the rates is widened by a millionth.
-        assert np.all(gap <= reach[cell] + 1e-5)
-        bent = max(bent, float(gap.max()))
-    assert bent > 1e-3
-
-
-def test_every_pair_of_angles_lies_in_a_cell_that_counts(system):
-    box = ProofBox(0.4, 1.0, 1.5, 2.0, angle_error=0.1, angular_rate_error=0.5)
-    condition = LiftedCondition(system, box, np.eye(5), exact(np.zeros((5, 5))))
-    cells = grid(np.array([0.0, -0.4]), np.array([0.4, 0.4]), (16, 32))
-    # Cells whose edges do not meet the bound of the error.
-    fine = grid(np.array([0.0, -0.4]), np.array([0.4, 0.4]), (83, 171))
-    start = condition.start()
-    assert np.all(start.lower.min(axis=0) == [0.0, -0.4])
-    assert np.all(start.upper.max(axis=0) == 0.4)
-    rng = np.random.default_rng(9)
-    angle = np.clip(rng.uniform(0.0, 0.5, 2000), 0.0, 0.4)
-    other = np.clip(angle + np.clip(rng.uniform(-0.15, 0.15, 2000), -0.1, 0.1), -0.4, 0.4)
-    place = np.stack([angle, other], axis=1)
-    for some in (start, cells, fine):
-        counts = some[~condition.examine(some).empty]
-        inside = (counts.lower - 1e-9 <= place[:, None]) & (place[:, None] <= counts.upper + 1e-9)
-        assert np.all(np.any(np.all(inside, axis=2), axis=1))
-
-
-def test_rates_off_the_corners_are_between_them(system, oracle):
-    """The oracle's J at any rate is in the hull of those at the corners, in every direction."""
-    box = ProofBox(0.4, 1.0, 1.5, 2.0)
-    dual = np.cov(np.random.default_rng(6).standard_normal((5, 12)))
-    condition = LiftedCondition(system, box, dual, exact(np.zeros((5, 5))))
-    place = 0.3
-    corners = condition.examine(exact(np.array([[place, place]]))).corners.midpoint[0]
-    rng = np.random.default_rng(8)
-    for _ in range(100):
-        y = np.array([0.0, place, *rng.uniform(-1, 1, 2)]) * [1.0, 1.0, box.velocity, 1.5]
-        control = rng.uniform(-1, 1, 1) * box.force
-        lifted = np.zeros((5, 5))
-        lifted[:4, :4] = oracle.jacobian(lambda at, u=control: oracle.rates(at, u), y)
-        lifted[:4, 4:] = oracle.input_matrix(y)
-        form = lifted @ dual + dual @ lifted.T
-        direction = rng.standard_normal((50, 5))
-        values = np.einsum("di,vij,dj->dv", direction, corners, direction)
-        value = np.einsum("di,ij,dj->d", direction, form, direction)
-        assert np.all(value <= values.max(axis=1) + 1e-9)
+def test_an_output_of_other_states_is_refused(system):
+    with pytest.raises(ValueError, match="output"):
+        design_held_contained(system, PLAN, HeldDesign(output=(1.0, 0.0)))
 
 
 def test_a_disturbance_without_a_contained_tube_is_refused(system):
     with pytest.raises(InfeasibleError, match="disturbance"):
         design_held_contained(system, PLAN, HeldDesign(disturbance_bound=3.0, degree=3))
-
-
-def test_a_lean_is_refused(system):
-    box = ProofBox(0.4, 1.0, 1.5, 2.0, lean=1.0)
-    with pytest.raises(ValueError, match="lean"):
-        LiftedCondition(system, box, np.eye(5), exact(np.zeros((5, 5))))
 
 
 @pytest.mark.parametrize(
@@ -305,7 +230,6 @@ def test_a_lean_is_refused(system):
         ({"disturbance_bound": float("nan")}, "disturbance_bound"),
         ({"margin": -0.1}, "margin"),
         ({"degree": 0}, "degree"),
-        ({"output": (1.0, 0.0)}, "output"),
     ],
 )
 def test_values_out_of_range_are_refused(change, match):

@@ -16,6 +16,7 @@ from lagros_policies.contraction import (
     Metric,
     PlanRegion,
     Region,
+    Samples,
     certified_tube,
     contraction_residual,
     cosines,
@@ -32,8 +33,10 @@ from lagros_policies.contraction import (
     theorems,
     verify_metric,
 )
-from lagros_policies.proof.condition import prove_bounds
+from lagros_policies.proof import bounds
+from lagros_policies.proof.condition import prove_contraction
 from lagros_policies.remarks.stochastic import mean_square_bound
+from lagros_policies.tasks.cartpole.proof import prove_cartpole
 from tests.policies.foreign import (
     Car,
     Pvtol,
@@ -152,8 +155,13 @@ def test_a_metric_that_is_broken_by_its_true_rate_is_refused():
     found, worst = search_violation(Pvtol(), metric, 0)
     assert worst >= expected.max()
     assert brute_residual(Pvtol(), metric, found)[0] == pytest.approx(worst, rel=1e-5)
-    with pytest.raises(TypeError, match="must be a CartPole"):
-        prove_bounds(Pvtol(), metric, 0.5)
+    # The proof, too, says no, and where.
+    refused = prove_contraction(Pvtol(), metric, PVTOL_BOX)
+    point = refused.violation
+    assert not refused.proved
+    triple = Samples(*(part[None] for part in (point.state, point.nominal, point.control)))
+    same = Samples(triple.nominal, triple.nominal, triple.nominal_control)
+    assert max(brute_residual(Pvtol(), metric, one)[0] for one in (triple, same)) > 0.0
 
 
 # The design.
@@ -354,13 +362,17 @@ def test_what_is_no_metric_is_refused_by_name(change, why):
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_of_the_cartpole_refuses_another_basis_and_region():
-    metric = replace(load_metric(), point="nominal")
-    with pytest.raises(ValueError, match="at the nominal, on a Region: metric_drift is for"):
-        theorems.metric_drift(metric, 0.5)
+def test_what_is_of_one_coordinate_or_of_the_cartpole_refuses_another_metric():
+    two = built(Pvtol(), PVTOL_BOX, products(cosines(2, 1), cosines(1, 1)), "state")
+    with pytest.raises(ValueError, match=r"coordinates \(1, 2\): metric_drift is for one"):
+        bounds.metric_drift(two, 0.0, 0.5)
     boxed = Metric(positive(4)[None], 0.2, 9.0, 1.0, np.ones(4), CAR_BOX)
-    with pytest.raises(ValueError, match="on a BoxRegion"):
-        theorems.metric_drift(boxed, 0.5)
+    for metric, why in (
+        (replace(load_metric(), point="nominal"), "at the nominal, on a Region"),
+        (boxed, "on a BoxRegion"),
+    ):
+        with pytest.raises(ValueError, match=why):
+            prove_cartpole(metric)
 
 
 # Files.

@@ -13,8 +13,8 @@ from lagros_policies.contraction import (
     contraction_residual,
     load_metric,
 )
-from lagros_policies.proof.box import ProofBox
 from lagros_policies.tasks.cartpole import proof_design as module
+from lagros_policies.tasks.cartpole.box import ProofBox
 from lagros_policies.tasks.cartpole.proof_program import ProvedDesignSettings
 
 SETTINGS = ProvedDesignSettings(

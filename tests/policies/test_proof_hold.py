@@ -9,13 +9,18 @@ import pytest
 import lagros_policies
 from lagros_envs.numbers import Interval
 from lagros_policies.contraction import HeldControl, load_metric
-from lagros_policies.proof.box import ProofBox
 from lagros_policies.proof.cells import search
-from lagros_policies.proof.hold import HoldCondition
+from lagros_policies.proof.families import BoxCondition, hold_matrices
+from lagros_policies.tasks.cartpole.box import ProofBox
 
 PROVED = Path(lagros_policies.__file__).parent / "pretrained" / "cartpole_proved_metric.json"
 PERIOD, RATE = 0.1, 0.5
 SMALL = ProofBox(0.1, 0.3, 0.3, 0.3)
+
+
+def condition_of(system, metric, box, rate):
+    where = box.held_set(system)
+    return BoxCondition(where, hold_matrices(system, metric, rate, PERIOD, where))
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +49,7 @@ def test_corners_are_the_oracles_and_what_lies_between_is_within_the_remainder(
     low = rng.uniform([0.0, -1.5, -1.7], [0.85, 1.3, 1.2], (20, 3))
     cells = Interval(low, low + np.array([0.05, 0.2, 0.5]))
     box = ProofBox(0.9, 1.5, 1.5, 1.0)
-    found = HoldCondition(system, metric, box, RATE, PERIOD).examine(cells)
+    found = condition_of(system, metric, box, RATE).examine(cells)
     signs = np.array(list(np.ndindex(2, 2, 2)))
     for index, corner in enumerate(signs):
         expected = matrices(oracle, metric, np.where(corner, cells.upper, cells.lower))
@@ -61,8 +66,8 @@ def test_corners_are_the_oracles_and_what_lies_between_is_within_the_remainder(
 
 
 def test_a_small_box_is_proved_and_a_rate_that_is_too_fast_refused(oracle, system, metric):
-    assert search(HoldCondition(system, metric, SMALL, RATE, PERIOD), 400, 10**5, 60.0).proved
-    found = search(HoldCondition(system, metric, SMALL, 2.5, PERIOD), 400, 10**5, 60.0)
+    assert search(condition_of(system, metric, SMALL, RATE), 400, 10**5, 60.0).proved
+    found = search(condition_of(system, metric, SMALL, 2.5), 400, 10**5, 60.0)
     assert not found.proved
     point = found.failure
     place = np.array([[point.state[1], point.state[3], point.control[0]]])
@@ -71,7 +76,7 @@ def test_a_small_box_is_proved_and_a_rate_that_is_too_fast_refused(oracle, syste
 
 def test_a_metric_without_stiffness_is_refused(system, metric):
     bad = replace(metric, coefficients=np.eye(4)[None] * 1.0)
-    found = search(HoldCondition(system, bad, SMALL, 0.3, PERIOD), 400, 10**5, 60.0)
+    found = search(condition_of(system, bad, SMALL, 0.3), 400, 10**5, 60.0)
     assert found.failure is not None
 
 
@@ -87,38 +92,21 @@ def test_u_star_finds_contracting_forces_where_that_was_proved(system, metric):
         assert np.all(b * b - a * c > 0.0)
 
 
-def test_the_lean_widens_the_forces_with_the_angle(system, metric):
-    box = ProofBox(0.9, 1.5, 1.5, 1.0, lean=1.0)
-    condition = HoldCondition(system, metric, box, RATE, PERIOD)
-    for angle in (0.0, 0.3, 0.9):
-        balance = 1.1 * 9.8 * np.tan(angle)
-        # A bound over all angles up to this one, and not a loose one.
-        assert 1.75 + balance <= condition.largest_push(angle) <= 1.75 + 1.1 * balance + 1e-9
-    cells = condition.start()
-    # Every angle with every push of the set lies in a cell; a large push near the upright in none.
-    for angle, push, wanted in ((0.02, 1.7, True), (0.89, 14.0, True), (0.02, 9.0, False)):
-        low, high = cells.lower[:, [0, 2]], cells.upper[:, [0, 2]]
-        inside = np.all((low <= [angle, push]) & ([angle, push] <= high), axis=1)
-        assert np.any(inside) == wanted
-
-
-@pytest.mark.parametrize("lean", [0.0, 1.0])
-def test_every_point_of_the_set_lies_in_a_cell_that_counts(system, metric, lean):
-    box = ProofBox(0.9, 1.5, 1.5, 1.0, lean=lean)
-    condition = HoldCondition(system, metric, box, RATE, PERIOD)
-    # After two halvings too, which leave cells across the largest push.
-    for cells in (condition.start(), condition._cells((12, 12, 16))):
-        counts = cells[~condition._outside(cells)]
+def test_the_lean_widens_the_forces_with_the_angle(system):
+    where = ProofBox(0.9, 1.5, 1.5, 1.0, lean=1.0).held_set(system)
+    for cells in (where.cells((6, 6, 4)), where.cells((12, 12, 16))):
         rng = np.random.default_rng(5)
         place = np.clip(rng.uniform(-1.3, 1.3, (3000, 3)), -1.0, 1.0) * [0.9, 1.5, 1.75]
         place[:, 0] = np.abs(place[:, 0])
-        place[:, 2] += rng.choice([0.0, 0.5, 1.0], 3000) * lean * 1.1 * 9.8 * np.tan(place[:, 0])
-        slack = 1e-9
-        inside = (counts.lower - slack <= place[:, None]) & (place[:, None] <= counts.upper + slack)
+        lean = 1.1 * 9.8 * np.tan(place[:, 0])
+        place[:, 2] += rng.choice([0.0, 0.5, 1.0], 3000) * lean
+        inside = (cells.lower - 1e-9 <= place[:, None]) & (place[:, None] <= cells.upper + 1e-9)
         assert np.all(np.any(np.all(inside, axis=2), axis=1))
+    # A large push near the upright is in none.
+    assert not np.any((cells.lower[:, 0] < 0.02) & (cells.lower[:, 2] > 4.0))
 
 
 @pytest.mark.slow
 def test_the_shipped_proof_over_the_hold_can_be_made_again(system, metric):
     box = ProofBox(0.9, 1.5, 1.5, 1.0, lean=1.0)
-    assert search(HoldCondition(system, metric, box, RATE, PERIOD), 400, 10**6, 600.0).proved
+    assert search(condition_of(system, metric, box, RATE), 400, 10**6, 600.0).proved

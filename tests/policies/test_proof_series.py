@@ -6,15 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lagros_envs.numbers import Interval, Series, dual, exact, functions, variable
+from lagros_envs.numbers import Dual, Interval, Series, dual, exact, functions, variable
 from lagros_envs.numbers.functions import cos, sin
-from lagros_policies.contraction import load_metric
-from lagros_policies.proof.motion import (
-    accelerations,
-    control_square,
-    jacobian_parts,
-    metric_series,
-)
+from lagros_policies.contraction import Basis, BoxRegion, Metric, load_metric
+from lagros_policies.proof.enclosures import constant, enclosed_metric, held_slopes, slopes
+from tests.policies.foreign import positive
 
 
 def series_of(x):
@@ -68,52 +64,63 @@ def test_arrays_on_the_left_and_divided_constants_are_understood():
     assert cos(0.5) == np.cos(0.5)
 
 
-def test_the_parts_of_the_jacobian_give_the_oracles(oracle, system):
+def test_slopes_are_the_oracles_and_over_cells_enclose_those_inside(oracle, system):
     rng = np.random.default_rng(0)
     point = rng.uniform(-1.0, 1.0, (200, 5)) * [5.0, 1.3, 4.0, 6.0, 40.0]
-    parts = jacobian_parts(system, accelerations(system, exact(point[:, 1]), 1))
-    push = point[:, 4] - oracle.mu_cart * point[:, 2]
-    wide = (slice(None), None, None)
-    found = parts.at(0, push[wide], np.zeros(200)[wide], point[:, 3][wide], point[:, 3][wide] ** 2)
+    thin = [variable(exact(part), 2) for part in point.T]
+    slope, gain = slopes(system, thin[:4], thin[4:])
     expected = oracle.jacobian(lambda x: oracle.rates(x, point[:, 4:]), point[:, :4])
-    assert np.abs(found.midpoint - expected).max() < 1e-8
-    assert found.radius.max() < 1e-8
-    square = oracle.input_matrix(point[:, :4])
-    held = control_square(accelerations(system, exact(point[:, 1]), 1)).parts[0]
-    np.testing.assert_allclose(
-        held.midpoint, square @ np.swapaxes(square, -1, -2), rtol=1e-9, atol=1e-12
-    )
+    np.testing.assert_allclose(slope.parts[0].midpoint, expected, atol=1e-8)
+    np.testing.assert_allclose(gain.parts[0].midpoint, oracle.input_matrix(point[:, :4]))
+    assert slope.parts[0].radius.max() < 1e-8
+    wide = [variable(Interval(part - 0.01, part + 0.01), 2) for part in point.T]
+    for whole, part in zip(slopes(system, wide[:4], wide[4:]), (slope, gain), strict=True):
+        for order in range(3):
+            assert np.all(whole.parts[order].lower <= part.parts[order].upper)
+            assert np.all(part.parts[order].lower <= whole.parts[order].upper)
 
 
-def test_the_balance_holds_the_pole_still(oracle, system):
-    angle = np.linspace(-1.2, 1.2, 25)
-    force = accelerations(system, exact(angle), 1).balance.parts[0].midpoint
-    states = np.zeros((25, 4))
-    states[:, 1] = angle
-    assert np.abs(oracle.rates(states, force[:, None])[:, 3]).max() < 1e-9
-
-
-def test_the_parts_over_cells_enclose_derivatives_inside(system):
-    ends = np.linspace(-1.0, 1.0, 21)
-    cells = Interval(ends[:-1], ends[1:])
-    wide = jacobian_parts(system, accelerations(system, cells, 3))
+def test_the_map_of_a_hold_and_its_slopes_are_the_oracles(oracle, system):
     rng = np.random.default_rng(1)
-    for _ in range(5):
-        inside = exact(rng.uniform(cells.lower, cells.upper))
-        thin = jacobian_parts(system, accelerations(system, inside, 3))
-        for name in ("still", "by_push", "by_rate", "by_square", "by_balance"):
-            for order in range(3):
-                whole = getattr(wide, name).derivative(order)
-                part = getattr(thin, name).derivative(order)
-                assert np.all(whole.lower <= part.upper)
-                assert np.all(part.lower <= whole.upper)
+    point = rng.uniform(-1.0, 1.0, (50, 5)) * [5.0, 0.9, 2.0, 2.0, 10.0]
+    thin = [constant(part, 0) for part in point.T]
+    ended, slope, gain = held_slopes(system, thin[:4], thin[4:], 0.1)
+    full = oracle.jacobian(lambda z: oracle.step(z[:, :4], z[:, 4:]), point)
+    after = np.stack([one.parts[0].midpoint for one in ended], axis=-1)
+    np.testing.assert_allclose(after, oracle.step(point[:, :4], point[:, 4:]), atol=1e-9)
+    np.testing.assert_allclose(slope.parts[0].midpoint, full[..., :4], atol=1e-9)
+    np.testing.assert_allclose(gain.parts[0].midpoint, full[..., 4:], atol=1e-9)
 
 
-def test_the_metrics_series_is_the_metric_and_its_rate():
+def test_a_metric_and_its_rate_are_enclosed_sharply():
     metric, angle = load_metric(), np.linspace(-1.1, 1.1, 23)
-    series = metric_series(metric, variable(exact(angle), 1))
     states, motion = np.zeros((23, 4)), np.zeros(4)
     states[:, 1], motion[1] = angle, 1.0
+    zero = constant(np.zeros(23), 1)
+    place = [Dual(zero, zero) for _ in range(4)]
+    place[1] = Dual(variable(exact(angle), 1), zero + 1.0)
+    found = enclosed_metric(metric, place)
     rate = metric.dual_rate(states, motion)
-    np.testing.assert_allclose(series.parts[0].midpoint, metric.dual(states), atol=1e-9)
-    np.testing.assert_allclose(series.derivative(1).midpoint, rate, atol=1e-8)
+    np.testing.assert_allclose(found.value.parts[0].midpoint, metric.dual(states), atol=1e-9)
+    for part in (found.value.derivative(1), found.gradient.parts[0]):
+        np.testing.assert_allclose(part.midpoint, rate, atol=1e-8)
+        assert part.radius.max() < 1e-8 * np.abs(rate).max()
+    # Coefficients of both signs, some thousand times larger than what they add up to.
+    wide = enclosed_metric(metric, [constant(Interval(angle - 0.01, angle + 0.01), 0)] * 4)
+    assert np.all(wide.parts[0].contains(metric.dual(states)))
+    assert np.median(wide.parts[0].radius) < 0.1 * np.abs(metric.dual(states)).max()
+
+
+def test_a_metric_of_several_coordinates_is_enclosed():
+    rng = np.random.default_rng(2)
+    basis = Basis(("1", "x[0]^2*cos(x[1])", "sin(x[1])^3", "x[0]*x[2]", "cos(x[1])"))
+    parts = np.stack([positive(3), *(0.05 * positive(3, seed) for seed in range(1, 5))])
+    box = BoxRegion((-1.0,) * 3, (1.0,) * 3, (1.0,) * 3, (0.0,), (1.0,))
+    metric = Metric(parts, 0.2, 50.0, 3.0, np.ones(3), box, basis=basis)
+    states = rng.uniform(-1.0, 1.0, (40, 3))
+    thin = enclosed_metric(metric, [constant(part, 0) for part in states.T]).parts[0]
+    np.testing.assert_allclose(thin.midpoint, metric.dual(states), rtol=1e-12)
+    cells = [constant(Interval(part - 0.1, part + 0.1), 0) for part in states.T]
+    wide = enclosed_metric(metric, cells).parts[0]
+    for _ in range(20):
+        assert np.all(wide.contains(metric.dual(states + rng.uniform(-0.1, 0.1, states.shape))))

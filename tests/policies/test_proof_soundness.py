@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -11,21 +10,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lagros_policies
-from lagros_envs.numbers import Interval
+from lagros_envs.numbers import Interval, exact
 from lagros_policies.contraction import Metric, load_metric
 from lagros_policies.contraction.double_integrator import certified_margin, design_axis, flow
 from lagros_policies.contraction.ellipsoid import prove_tube
 from lagros_policies.contraction.statement import at_most
-from lagros_policies.contraction.tube_design import PlanBox, TubeDesign, design_contained
-from lagros_policies.proof.box import ProofBox
+from lagros_policies.contraction.tube_design import TubeDesign, design_contained
+from lagros_policies.proof import condition
 from lagros_policies.proof.condition import prove_contraction
-from lagros_policies.proof.hold import HoldCondition
-from lagros_policies.proof.rates import rate_condition, triangle_tip
-from lagros_policies.tasks.cartpole import proof as statements
+from lagros_policies.proof.families import BoxCondition, held_ends, rate_matrices
+from lagros_policies.tasks.cartpole.box import ProofBox
 from lagros_policies.tasks.cartpole.certificate import (
     CartPoleQuestion,
     cartpole_certificate,
 )
+from lagros_policies.tasks.cartpole.plans import PlanBox
 from lagros_policies.tasks.cartpole.proof import prove_cartpole
 
 PROVED = Path(lagros_policies.__file__).parent / "pretrained" / "cartpole_proved_metric.json"
@@ -37,46 +36,11 @@ def proved():
     return load_metric(PROVED)
 
 
-@given(st.floats(-9.0, 9.0), st.floats(0.0, 5.0), st.floats(0.0, 1.0))
-def test_the_triangle_holds_the_parabola_in_exact_arithmetic(low, width, share):
-    high = low + width
-    middle, tip = (float(part[0]) for part in triangle_tip(np.array([low]), np.array([high])))
-    a, b, m, q = (Fraction(value) for value in (low, high, middle, tip))
-    # Close to an end as well, where an edge that is moved by rounding would cut the parabola off.
-    for w in (a + (b - a) * Fraction(share), a + (b - a) / 10**9, b - (b - a) / 10**9):
-        side, at = (a, a * a) if w <= m else (b, b * b)
-        edge = at if m == side else at + (q - at) * (w - side) / (m - side)
-        assert edge <= w * w <= (a + b) * w - a * b
-    # And it is no larger than it need be.
-    assert float(a * b - q) <= 1e-12 * (1.0 + float(a * a + b * b))
-
-
-def test_the_rates_of_x_and_y_lie_in_the_hull_of_the_corners(system, proved):
-    """The pairs (w_y, w_x) of errors up to a bound, in the box, cell by cell."""
-    box = ProofBox(0.3, 0.5, 1.5, 0.5, 0.1, 0.7)
-    condition = rate_condition(system, proved, box, 0.5)
-    cells = condition.start()
-    choices = condition._choices(cells)
-    rng = np.random.default_rng(0)
-    for index in range(0, len(cells.lower), 16):
-        low, high = cells.lower[index, 2], cells.upper[index, 2]
-        ends = {}
-        for choice in choices:
-            if choice.real:
-                ends.setdefault(choice.other_rate[index], []).append(choice.rate[index])
-        assert set(ends) == {low, high}
-        for other in rng.uniform(low, high, 40):
-            t = (other - low) / (high - low)
-            least = (1 - t) * min(ends[low]) + t * min(ends[high])
-            most = (1 - t) * max(ends[low]) + t * max(ends[high])
-            assert least <= max(other - 0.7, -1.5)
-            assert most >= min(other + 0.7, 1.5)
-
-
 @pytest.mark.parametrize("lean", [0.0, 1.0])
 def test_the_angle_after_a_hold_is_bounded_closely(lean, system, proved, oracle):
     box = ProofBox(0.9, 1.5, 1.5, 1.0, lean=lean)
-    found = HoldCondition(system, proved, box, 0.5, 0.1).largest_angle_after()
+    _, ended = held_ends(system, box.held_set(system), 0.1, (20, 10, 6))
+    found = max(np.abs(ended[1].lower).max(), np.abs(ended[1].upper).max())
     rng = np.random.default_rng(1)
     state = np.clip(rng.uniform(-1.5, 1.5, (20_000, 4)), -1, 1) * [1.0, 0.9, 1.5, 1.5]
     force = rng.choice([-1.0, 1.0], (20_000, 1))
@@ -90,9 +54,11 @@ def test_a_metric_that_is_none_where_a_hold_ends_is_refused(system, proved, monk
     assert np.linalg.eigvalsh(proved.dual(np.array([0.0, 1.3, 0.0, 0.0])))[0] < 0.0
     asked = {"system": system, "held_box": SMALL}
     assert prove_cartpole(proved, SMALL, **asked).statements[-1].holds
-    monkeypatch.setattr(statements.HoldCondition, "largest_angle_after", lambda self: 1.3)
+    far = [exact(np.full(1, 1.3))] * 4
+    monkeypatch.setattr(condition, "held_ends", lambda *_: (far, far))
     found = prove_cartpole(proved, SMALL, **asked)
-    assert found.held.proved
+    assert found.held.search.proved
+    assert not found.held.proved
     assert not found.statements[-1].holds
 
 
@@ -205,10 +171,10 @@ def test_the_margin_of_the_spacecraft_is_above_a_finer_integral(rate):
 
 def test_a_width_is_what_a_proof_is_made_of(system, proved):
     """An enclosure that is a number only: the corners hold everywhere, and prove nothing."""
-    condition = rate_condition(system, replace(proved, contraction_rate=0.5), SMALL, 0.5)
+    condition = BoxCondition(SMALL.proof_set(system), rate_matrices(system, proved, 0.5))
     cells = condition.start()
     found = condition.examine(cells)
     widths = [np.abs(part.radius).max() + np.abs(part.midpoint).max() for part in found.remainders]
-    assert widths[0] > 0.0
+    assert widths[0] > 1e-9
     assert isinstance(found.corners, Interval)
     assert np.all(found.corners.upper > found.corners.lower)

@@ -11,16 +11,16 @@ from lagros_policies.contraction.theorems import (
     disturbed_rate,
     feasibility_residual,
     gain_residual,
-    lipschitz_constant,
-    metric_drift,
     tube_ball,
     tube_ellipsoid,
 )
-from lagros_policies.proof.box import ProofBox
+from lagros_policies.proof.bounds import metric_drift
+from lagros_policies.tasks.cartpole.box import ProofBox
+from lagros_policies.tasks.cartpole.lipschitz import lipschitz_constant
 
 
 def test_the_drift_bounds_the_relative_slope_of_the_metric_closely(metric, constant_metric):
-    drift = metric_drift(metric, 0.8)
+    drift = metric_drift(metric, 0.0, 0.8)
     states = np.zeros((801, 4))
     states[:, 1] = np.linspace(-0.8, 0.8, 801)
     step = 1e-6
@@ -32,7 +32,7 @@ def test_the_drift_bounds_the_relative_slope_of_the_metric_closely(metric, const
     largest = np.abs(np.linalg.eigvals(relative)).max()
     assert largest <= drift * (1 + 1e-6)
     assert drift <= 1.25 * largest
-    assert metric_drift(constant_metric, 0.8) == 0.0
+    assert metric_drift(constant_metric, 0.0, 0.8) == 0.0
 
 
 @pytest.mark.parametrize(("constant", "slope"), [(0.5, 1.4), (2.0, -1.4)])
@@ -45,7 +45,7 @@ def test_the_drift_of_few_cells_is_a_bound_or_an_error(metric, constant, slope):
     proved = 0
     for cells in (1, 2, 4, 8, 64, 1000):
         try:
-            assert metric_drift(plain, 0.8, cells) >= largest
+            assert metric_drift(plain, 0.0, 0.8, cells) >= largest
         except ValueError:
             continue
         proved += 1
@@ -69,13 +69,13 @@ def test_the_disturbed_rate_is_what_the_worst_error_needs(metric, oracle):
     ahead, back = (here + side * h * push for side in (1.0, -1.0))
     moved = oracle.energy(metric, ahead, ahead - error) - oracle.energy(metric, back, back - error)
     added, energy = abs(float(moved)) / (2 * h), float(oracle.energy(metric, here, here - error))
-    lost = metric.contraction_rate - disturbed_rate(metric, metric_drift(metric, 0.8), 0.3)
+    lost = metric.contraction_rate - disturbed_rate(metric, metric_drift(metric, 0.0, 0.8), 0.3)
     assert added <= 2.0 * lost * energy * (1 + 1e-4) <= 1.3 * added
 
 
 def test_the_disturbed_rate_covers_what_moves_the_metric(metric, oracle):
     """dV/dt under a disturbance of the angle exceeds the paper's bound, and not ours."""
-    drift, bound = metric_drift(metric, 0.8), 0.3
+    drift, bound = metric_drift(metric, 0.0, 0.8), 0.3
     rng = np.random.default_rng(2)
     state = rng.uniform(-0.4, 0.4, (4000, 4))
     nominal = state - rng.uniform(-0.3, 0.3, (4000, 4))

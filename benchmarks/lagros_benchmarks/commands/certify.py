@@ -190,6 +190,6 @@ def _lines(found: Certificate) -> Table:
     table.add_column("claim")
     # What does not hold first.
     for line in sorted(found.statements, key=lambda line: line.holds):
-        holds = "yes" if line.holds else "NO"
+        holds = line.verdict
         table.add_row(line.kind, holds, f"{line.seconds:.1f}", Text(line.text))
     return table

@@ -25,8 +25,9 @@ from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.condition import Samples, condition_terms, contraction_residual
 from lagros_policies.contraction.cvstem import CvStemSettings, InfeasibleError
 from lagros_policies.contraction.regions import Region
-from lagros_policies.contraction.systems import check_cartpole, check_sizes
+from lagros_policies.contraction.systems import check_sizes
 from lagros_policies.remarks.neural.metric import SIZE
+from lagros_policies.tasks.cartpole.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]
 

@@ -21,7 +21,6 @@ from lagros_envs.dynamics import System, control_matrix, state_dependent_coeffic
 from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.condition import Samples
 from lagros_policies.contraction.regions import Region
-from lagros_policies.contraction.systems import check_cartpole
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.remarks.neural.design import AngleSolution
 from lagros_policies.remarks.neural.metric import (
@@ -31,6 +30,7 @@ from lagros_policies.remarks.neural.metric import (
     feature,
     feature_slope,
 )
+from lagros_policies.tasks.cartpole.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]
 

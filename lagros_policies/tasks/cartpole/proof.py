@@ -2,43 +2,27 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass, replace
+import math
+from dataclasses import replace
 
-from lagros_envs.tasks.cartpole.physics import CartPole
+from lagros_envs.tasks.cartpole.physics import ANGLE, CartPole
 from lagros_policies.contraction.metric import Metric
-from lagros_policies.contraction.statement import Statement, at_most
-from lagros_policies.proof.cells import Search, search
+from lagros_policies.contraction.statement import at_most
 from lagros_policies.proof.condition import (
-    ContractionProof,
-    ProofBox,
-    ProvedBounds,
-    prove_bounds,
+    Proof,
+    bounds_statement,
+    contraction_statement,
+    held_statement,
     prove_contraction,
+    prove_hold,
 )
-from lagros_policies.proof.hold import HeldViolation, HoldCondition
+from lagros_policies.tasks.cartpole.box import ProofBox
+from lagros_policies.tasks.cartpole.systems import check_cartpole_metric
 
-# Cells of one pass of the condition over a hold.
-_BATCH = 400
+# Cells of angle, rate and push that enclose where a hold ends.
+_ENDS = (20, 10, 6)
 
 PROVED_BOX = ProofBox.apart(angle=0.9, velocity=1.5, angular_rate=1.5, force=1.0)
-
-
-@dataclass(frozen=True)
-class CartPoleProof:
-    """The proofs behind the statements.
-
-    Attributes:
-        statements: What was claimed, and whether it was proved.
-        contraction: Theorem 2's condition on the box.
-        bounds: Bounds of W_bar and B on the box; None if W_bar is not positive definite on it.
-        held: The condition over a hold; None if it was not asked for.
-    """
-
-    statements: list[Statement]
-    contraction: ContractionProof
-    bounds: ProvedBounds | None
-    held: Search[HeldViolation] | None
 
 
 def prove_cartpole(
@@ -51,7 +35,7 @@ def prove_cartpole(
     held_rate: float | None = None,
     period: float = 0.1,
     most_seconds: float = 60.0,
-) -> CartPoleProof:
+) -> Proof:
     """Prove a metric on a box, by interval arithmetic.
 
     Args:
@@ -69,36 +53,31 @@ def prove_cartpole(
         within the time does not hold.
     """
     system = system or CartPole()
+    check_cartpole_metric(metric, "prove_cartpole")
     proof = prove_contraction(system, metric, box, contraction_rate, most_seconds=most_seconds)
-    statements = [
-        Statement(
-            f"-dW/dt + 2 sym(A W) - 2 nu B B' < -2 alpha W, equation (14), with alpha = "
-            f"{proof.contraction_rate:g} 1/s and nu = {metric.control_weight:.6g} (W as in its "
-            f"file) for {describe(box)}",
-            "proved",
-            proof.proved,
-            proof.seconds,
-        )
-    ]
-    bounds, statement = _bounds(system, metric, box)
-    statements.append(statement)
-    held = None
-    if held_box is not None:
-        rate = metric.contraction_rate if held_rate is None else held_rate
-        condition = HoldCondition(system, metric, held_box, rate, period)
-        held = search(condition, _BATCH, 1_000_000, most_seconds)
-        start = time.monotonic()
-        after = condition.largest_angle_after()
-        definite = _definite(system, metric, max(after, held_box.angle))
-        text = (
-            f"under a force held for {period:g} s, some force shrinks an infinitesimal error by "
-            f"exp(-alpha {period:g} s) in the metric from one control instant to the next, with "
-            f"alpha = {rate:g} 1/s, for {describe(replace(held_box, **_NO_ERRORS))}; W is positive "
-            f"definite wherever the hold ends, |theta| <= {at_most(after)} rad"
-        )
-        seconds = held.seconds + time.monotonic() - start
-        statements.append(Statement(text, "proved", held.proved and definite, seconds))
-    return CartPoleProof(statements, proof, bounds, held)
+    half = angle_box(box.angle)
+    bounds, line = bounds_statement(system, metric, *half, f"every |theta| <= {box.angle:g} rad")
+    lines = [contraction_statement(proof, metric, describe(box)), line]
+    if held_box is None:
+        return Proof(lines, proof, bounds)
+    rate = metric.contraction_rate if held_rate is None else held_rate
+    held = prove_hold(
+        *(system, metric, held_box, rate, period),
+        counts=_ENDS,
+        also=(ANGLE,),
+        most_seconds=most_seconds,
+    )
+    after = max(abs(end) for end in held.ends[ANGLE])
+    where = describe(replace(held_box, **_NO_ERRORS))
+    lines.append(held_statement(held, rate, period, where, f"|theta| <= {at_most(after)} rad"))
+    return Proof(lines, proof, bounds, held)
+
+
+def angle_box(angle: float) -> tuple[list[float], list[float]]:
+    """Return the bounds of states with |theta| <= angle, each (4,); all else is free."""
+    low, high = [-math.inf] * 4, [math.inf] * 4
+    low[ANGLE], high[ANGLE] = -angle, angle
+    return low, high
 
 
 def describe(box: ProofBox) -> str:
@@ -125,28 +104,3 @@ def describe(box: ProofBox) -> str:
 
 
 _NO_ERRORS = {"angle_error": 0.0, "angular_rate_error": 0.0}
-
-
-def _definite(system: CartPole, metric: Metric, angle: float) -> bool:
-    """Return whether W_bar is shown to be positive definite for every |theta| <= angle."""
-    try:
-        prove_bounds(system, metric, angle)
-    except ValueError:
-        return False
-    return True
-
-
-def _bounds(
-    system: CartPole, metric: Metric, box: ProofBox
-) -> tuple[ProvedBounds | None, Statement]:
-    """Prove I <= S W_bar S <= chi I and b_bar on the box."""
-    start = time.monotonic()
-    claim = f"I <= S W S <= chi I with chi = {at_most(metric.condition_bound, 6)} "
-    where = f"for every |theta| <= {box.angle:g} rad"
-    try:
-        bounds = prove_bounds(system, metric, box.angle)
-    except ValueError:
-        return None, Statement(claim + where, "proved", False, time.monotonic() - start)
-    holds = bounds.least >= 1.0 and bounds.largest <= metric.condition_bound
-    text = f"{claim}and ||B|| <= b_bar = {at_most(bounds.control_gain, 6)} {where}"
-    return bounds, Statement(text, "proved", holds, bounds.seconds)

@@ -19,8 +19,9 @@ from lagros_envs.files import write_atomic
 from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.metric_files import metric_record
-from lagros_policies.proof.rates import Violation
-from lagros_policies.tasks.cartpole.proof import CartPoleProof, prove_cartpole
+from lagros_policies.proof.condition import Proof
+from lagros_policies.proof.families import Violation
+from lagros_policies.tasks.cartpole.proof import prove_cartpole
 from lagros_policies.tasks.cartpole.proof_program import (
     Points,
     ProvedDesignSettings,
@@ -31,7 +32,7 @@ from lagros_policies.tasks.cartpole.proof_program import (
 
 def design_proved(
     settings: ProvedDesignSettings | None = None, system: CartPole | None = None
-) -> tuple[Metric, CartPoleProof, CartPoleProof]:
+) -> tuple[Metric, Proof, Proof]:
     """Design a metric and prove it, feeding failures back.
 
     Args:
@@ -62,14 +63,14 @@ def design_proved(
         if all(part.holds for part in (*proof.statements, *second.statements)):
             return metric, proof, second
         found = [proof.contraction.violation, second.contraction.violation]
-        over = None if second.held is None else second.held.failure
+        over = None if second.held is None else second.held.search.failure
         if not any(found) and over is None:
             # Nothing failed: the proofs ran out of time, and would again.
             break
         for point in found:
             pool = pool if point is None else pool.joined(_around(point))
         if over is not None:
-            held = held.joined(_around(Violation(over.state, over.state, over.control)))
+            held = held.joined(_around(over))
     missed = [part.text for part in (*proof.statements, *second.statements) if not part.holds]
     raise RuntimeError(
         f"not proved after at most {settings.rounds} designs: {'; '.join(missed)}. Raise the "
@@ -83,7 +84,7 @@ def _around(point: Violation) -> Points:
 
 def write_proved(
     metric: Metric,
-    proofs: Sequence[CartPoleProof],
+    proofs: Sequence[Proof],
     settings: ProvedDesignSettings,
     path: Path | str,
 ) -> None:

@@ -22,17 +22,16 @@ from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY, Ca
 from lagros_policies.contraction.basis import cosine_powers, cosine_rates
 from lagros_policies.contraction.cvstem import CvStemSettings, InfeasibleError
 from lagros_policies.contraction.metric import Metric
-from lagros_policies.contraction.regions import Region
 from lagros_policies.contraction.semidefinite import (
     ConeProgram,
     cone_rows,
     svec,
     symmetric_basis,
 )
-from lagros_policies.contraction.systems import check_cartpole
-from lagros_policies.proof.box import ProofBox
-from lagros_policies.proof.condition import prove_bounds
-from lagros_policies.tasks.cartpole.proof import PROVED_BOX
+from lagros_policies.proof.bounds import prove_bounds
+from lagros_policies.tasks.cartpole.box import ProofBox
+from lagros_policies.tasks.cartpole.proof import PROVED_BOX, angle_box
+from lagros_policies.tasks.cartpole.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]
 
@@ -271,9 +270,9 @@ def _normalised(
         condition_bound=float(weights[1]),
         control_weight=float(weights[0]),
         scaling=np.asarray(settings.cvstem.scaling),
-        region=_region(settings.box),
+        region=settings.box.region,
     )
-    bounds = prove_bounds(system, metric, angle)
+    bounds = prove_bounds(system, metric, *angle_box(angle))
     # A little room, so that rounding of the scaled coefficients breaks no bound.
     factor = (1.0 + 1e-9) / bounds.least
     metric = replace(
@@ -283,16 +282,6 @@ def _normalised(
         control_weight=metric.control_weight * factor,
     )
     return metric, float(weights[2]) * factor
-
-
-def _region(box: ProofBox) -> Region:
-    return Region(
-        angle=box.angle,
-        angular_rate=box.angular_rate,
-        angle_error=box.angle_error,
-        angular_rate_error=box.angular_rate_error,
-        force=box.force,
-    )
 
 
 def _spread_columns(block: FloatArray, entries: int, places: tuple[int, int]) -> FloatArray:

@@ -27,13 +27,14 @@ from lagros_policies.contraction.held_design import HeldDesign, HeldTube, design
 from lagros_policies.contraction.statement import Statement
 from lagros_policies.contraction.tube_design import (
     ConstantTube,
-    PlanBox,
     TubeDesign,
     design_contained,
 )
-from lagros_policies.proof.box import ProofBox
+from lagros_policies.proof.condition import Proof
+from lagros_policies.tasks.cartpole.box import ProofBox
 from lagros_policies.tasks.cartpole.certificate import CartPoleQuestion, cartpole_certificate
-from lagros_policies.tasks.cartpole.proof import CartPoleProof, prove_cartpole
+from lagros_policies.tasks.cartpole.plans import PlanBox
+from lagros_policies.tasks.cartpole.proof import prove_cartpole
 from lagros_policies.tasks.cartpole.proof_program import ProvedDesignSettings
 
 # The bound that the paper's radius of 3.15 belongs to, by the formula it is computed with.
@@ -220,7 +221,7 @@ def load_cartpole_metric(path: Path | None) -> Metric:
 
 def prove_multiple(
     metric: Metric, factor: float, most_seconds: float
-) -> tuple[ProofBox, CartPoleProof, CartPoleProof]:
+) -> tuple[ProofBox, Proof, Proof]:
     """Prove (14) and the condition over a hold on a multiple of the boxes of the shipped metric.
 
     Args:
@@ -274,12 +275,12 @@ def largest_proofs(metric: Metric, most_seconds: float) -> tuple[ProofBox, Seque
     return box, (*lines, Statement(text, "proved", low > 0, max(spent, 0.0)))
 
 
-def merged(*proofs: CartPoleProof) -> list[Statement]:
+def merged(*proofs: Proof) -> list[Statement]:
     """Return the statements of proofs, each text once."""
     return list({line.text: line for proof in proofs for line in proof.statements}.values())
 
 
-def _proved(trial: tuple[ProofBox, CartPoleProof, CartPoleProof]) -> bool:
+def _proved(trial: tuple[ProofBox, Proof, Proof]) -> bool:
     """Return whether the conditions were proved; the chi of the metric's file is not asked for."""
     _, first, second = trial
     held = second.statements[-1].holds
