@@ -28,11 +28,11 @@ from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.double_integrator import certified_margin, design_axis
 from lagros_policies.remarks.lagrangian import (
     SlidingAxis,
-    SlidingTracking,
     peak_position_error,
     steady_position_bound,
 )
 from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy, CentralizedState
+from lagros_policies.tasks.spacecraft.sliding import SlidingTracking
 from lagros_policies.tasks.spacecraft.wrench_control import WrenchTracking
 
 FloatArray = NDArray[np.float64]

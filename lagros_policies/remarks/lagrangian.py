@@ -8,7 +8,7 @@ For H(q) q'' + C(q, q') q' + G(q) = tau the remark after Theorem 2 names the sli
 the metric H, because H' - 2C is skew; then q~ = q - q_d follows q~' = -lambda q~ + s. Two systems
 in a row, each contracting: no metric to design, no program to solve.
 
-The spacecraft has C = G = 0 and a constant H, so that each axis is a double integrator in its
+A body that floats has C = G = 0 and a constant H, so that each axis is a double integrator in its
 error. Here the law is made for a control that is held for h: the deviation v is the one for which
 
     s[k + 1] = rho_s s[k],                   rho_s = exp(-k h)
@@ -26,11 +26,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.aliases import moved_names
 from lagros_envs.checks import check_not_negative, check_positive, check_whole
-from lagros_envs.tasks.spacecraft.physics import Spacecraft, check_spacecraft
-from lagros_policies.tasks.spacecraft.thrusters import held_thrust
 
 FloatArray = NDArray[np.float64]
+__getattr__ = moved_names(__name__)
 
 # What is left of an impulse response after this many steps of the slower mode is nothing.
 _TAIL = 1e-12
@@ -108,57 +108,6 @@ class SlidingAxis:
         by_sliding, by_error = self.gains
         value: FloatArray = by_error * error - by_sliding * self.sliding(error, speed_error)
         return value
-
-
-@dataclass(frozen=True)
-class SlidingTracking:
-    """The tracking law and its thrusters; the calls are those of `WrenchTracking`.
-
-    Attributes:
-        body: The spacecraft.
-        plane: The law of x and y.
-        turning: The law of the heading, of the same period.
-
-    Raises:
-        TypeError: The body is no spacecraft.
-        ValueError: The periods differ.
-    """
-
-    body: Spacecraft
-    plane: SlidingAxis
-    turning: SlidingAxis
-
-    def __post_init__(self) -> None:
-        """Check the periods."""
-        check_spacecraft(self.body, type(self).__name__)
-        if self.plane.period != self.turning.period:
-            raise ValueError(
-                f"plane and turning need one period, not {self.plane.period!r} and "
-                f"{self.turning.period!r}"
-            )
-
-    def acceleration(
-        self, state: FloatArray, nominal: FloatArray, nominal_acceleration: FloatArray
-    ) -> FloatArray:
-        """Return the acceleration of the law, shape (..., 3) [m/s^2, m/s^2, rad/s^2].
-
-        Args:
-            state: x, shape (..., 6).
-            nominal: x_d, shape (..., 6).
-            nominal_acceleration: Of x, y and heading under u_d, shape (..., 3).
-        """
-        error = state - nominal
-        plane = self.plane.deviation(error[..., :2], error[..., 3:5])
-        turn = self.turning.deviation(error[..., 2:3], error[..., 5:])
-        value: FloatArray = nominal_acceleration + np.concatenate([plane, turn], axis=-1)
-        return value
-
-    def control(
-        self, state: FloatArray, nominal: FloatArray, nominal_acceleration: FloatArray
-    ) -> FloatArray:
-        """Return the thrust, shape (..., 8), all >= 0 [N]; arguments as of `acceleration`."""
-        wanted = self.acceleration(state, nominal, nominal_acceleration)
-        return held_thrust(self.body, state, wanted, self.plane.period)
 
 
 @dataclass(frozen=True, slots=True)

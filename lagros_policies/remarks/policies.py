@@ -18,12 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_positive
+from lagros_envs.aliases import moved_names
 from lagros_envs.conventions import settings_of
 from lagros_envs.dynamics import System
 from lagros_envs.tasks.cartpole import task
-from lagros_envs.tasks.spacecraft.scenarios import Preset
-from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.contraction.metric import ContractionMetric
 from lagros_policies.observed import observed_rows
 from lagros_policies.policy import PolicyState, row_memories
@@ -33,13 +31,12 @@ from lagros_policies.remarks.adaptive import (
     friction_regressor,
     largest_gain,
 )
-from lagros_policies.remarks.lagrangian import SlidingAxis, SlidingTracking
 from lagros_policies.remarks.neural.metric import load_neural_metric
-from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
 from lagros_policies.tube_mpc import TubeMpcPolicy, TubeMpcState, check_own_metric
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
+__getattr__ = moved_names(__name__)
 
 # What the adaptation is prepared for: |dp/dt| [m/s] and |d2p/dt2| [m/s^2] of the cart, and how far
 # its friction [N s/m] and its mass [kg] may be from the model's.
@@ -167,47 +164,3 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
             )
         memory.step, memory.state, memory.wanted = step, state.copy(), wanted
         return self.adaptive.corrected(state, wanted, memory.estimate)
-
-
-class SlidingCentralizedPolicy(CentralizedPolicy):
-    """The centralised planner with a known Lyapunov function in place of the metric's u*.
-
-    Args:
-        settings: The task.
-        preset: The preset, or its name.
-        num_agents: Number of agents; None for the preset's own.
-        disturbance_bound: d_bar to prepare for, in units of the state per second.
-        position_rate: lambda, at which the position error follows the sliding variable [1/s].
-        sliding_rate: k, at which the sliding variable contracts [1/s].
-        turning_rate: Both rates of the heading [1/s].
-        margin: Room beyond touching that plans ask for first [m]; None takes it from the bound, as
-            u* at 2 1/s would, whose error is that of this law at 3 1/s.
-
-    Raises:
-        ValueError: A value is out of range.
-    """
-
-    name = "sliding-centralized"
-
-    def __init__(
-        self,
-        settings: SpacecraftSettings | None = None,
-        preset: str | Preset = "paper",
-        num_agents: int | None = None,
-        disturbance_bound: float = 0.4,
-        position_rate: float = 3.0,
-        sliding_rate: float = 3.0,
-        turning_rate: float = 0.3,
-        margin: float | None = None,
-    ) -> None:
-        """Build planner and law."""
-        super().__init__(settings, preset, num_agents, disturbance_bound, margin=margin)
-        period = self.settings.control_period
-        check_positive("turning_rate", turning_rate)
-        # It answers the calls of `WrenchTracking`, and a bound of its own comes with it.
-        law: Any = SlidingTracking(
-            self.settings.system,
-            SlidingAxis(position_rate, sliding_rate, period),
-            SlidingAxis(turning_rate, turning_rate, period),
-        )
-        self.tracking = law

@@ -62,4 +62,10 @@ NAMES = {
         "Lipschitz": f"{_CARTPOLE}.lipschitz",
         "metric_drift": "lagros_policies.proof.bounds",
     },
+    "lagros_policies.remarks.policies": {
+        "SlidingCentralizedPolicy": "lagros_policies.tasks.spacecraft.sliding",
+    },
+    "lagros_policies.remarks.lagrangian": {
+        "SlidingTracking": "lagros_policies.tasks.spacecraft.sliding",
+    },
 }

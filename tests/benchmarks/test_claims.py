@@ -22,7 +22,7 @@ from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 from tests.benchmarks import fakes
 
 CARTPOLE = ("learned", "lagros", "tube-mpc", "lqr", "ppo", "sac", "td3", "residual", "random")
-SLIDING = "lagros_policies.remarks.policies:SlidingCentralizedPolicy"
+SLIDING = "lagros_policies.tasks.spacecraft.sliding:SlidingCentralizedPolicy"
 
 
 @pytest.mark.parametrize("channels", ["all", "rates"])

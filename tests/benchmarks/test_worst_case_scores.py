@@ -42,9 +42,10 @@ from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.baselines import LqrPolicy
 from lagros_policies.contraction import certified_tube
-from lagros_policies.remarks.lagrangian import SlidingAxis, SlidingTracking, peak_position_error
+from lagros_policies.remarks.lagrangian import SlidingAxis, peak_position_error
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
+from lagros_policies.tasks.spacecraft.sliding import SlidingTracking
 
 FloatArray = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from lagros_policies.policy import _places
 from lagros_policies.remarks.neural.metric import load_neural_metric
 from lagros_policies.sb3_model import load_stable_baselines3
 from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
-from tests.policies.test_objects import CARTPOLE, OPTIONS, SPACECRAFT, world
+from tests.policies.test_objects import CARTPOLE, SLIDING, SPACECRAFT, world
 
 HUGE = 10**400
 # None of them is a value of any argument.
@@ -106,7 +106,7 @@ def test_weights_of_a_regulator_that_have_no_gain_are_named():
         make("lqr", world("cartpole"), state_weights=["1"] * 4)
 
 
-@pytest.mark.parametrize("name", ["tube-mpc", "centralized", f"{OPTIONS}SlidingCentralizedPolicy"])
+@pytest.mark.parametrize("name", ["tube-mpc", "centralized", SLIDING])
 def test_nothing_is_prepared_for_a_bound_that_no_world_has(name):
     with pytest.raises(ValueError, match=r"disturbance_bound=1e\+300 must be .* at most"):
         make(name, world("spacecraft"), disturbance_bound=1e300)

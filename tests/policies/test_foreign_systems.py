@@ -54,7 +54,7 @@ from lagros_policies.tasks.cartpole import proof as proof_cartpole
 from lagros_policies.tasks.cartpole import proof_program as program
 from lagros_policies.tasks.spacecraft import certificate as certificate_spacecraft
 from lagros_policies.tasks.spacecraft import proof as proof_spacecraft
-from lagros_policies.tasks.spacecraft import thrusters, wrench_control
+from lagros_policies.tasks.spacecraft import sliding, thrusters, wrench_control
 from tests.policies.foreign import (
     Pvtol,
     Ramp,
@@ -398,8 +398,9 @@ def spacecraft_calls(body: Any) -> Iterator[tuple[Callable[..., Any], Callable[[
         thrusters.wrench_of_acceleration: lambda f: f(body, state, wrench),
         thrusters.thrust_for_acceleration: lambda f: f(body, state, wrench),
         thrusters.held_thrust: lambda f: f(body, state, wrench, 0.1),
+        wrench_control.AxesTracking: lambda f: f(body, plane, plane),
         wrench_control.WrenchTracking: lambda f: f(body, plane, plane),
-        lagrangian.SlidingTracking: lambda f: f(body, axis, axis),
+        sliding.SlidingTracking: lambda f: f(body, axis, axis),
         proof_spacecraft.control_square: lambda f: f(body),
         proof_spacecraft.prove_spacecraft: lambda f: f(plane, None, body),
         certificate_spacecraft.spacecraft_certificate: lambda f: f(

@@ -9,11 +9,11 @@ from lagros_envs.dynamics import hold_step
 from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_policies.remarks.lagrangian import (
     SlidingAxis,
-    SlidingTracking,
     hierarchical_bound,
     peak_position_error,
     steady_position_bound,
 )
+from lagros_policies.tasks.spacecraft.sliding import SlidingTracking
 
 BODY, PERIOD = Spacecraft(), 0.1
 RATES = st.floats(0.2, 8.0)

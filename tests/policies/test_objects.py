@@ -24,10 +24,11 @@ from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 
 OPTIONS = "lagros_policies.remarks.policies:"
+SLIDING = "lagros_policies.tasks.spacecraft.sliding:SlidingCentralizedPolicy"
 CARTPOLE = (*NAMES, f"{OPTIONS}AdaptiveTubeMpcPolicy", f"{OPTIONS}NeuralTubeMpcPolicy")
 SPACECRAFT = (
     *SPACECRAFT_NAMES,
-    f"{OPTIONS}SlidingCentralizedPolicy",
+    SLIDING,
     "lagros+filter",
     "tube-mpc+filter",
     "centralized+filter",

@@ -23,7 +23,7 @@ from lagros_policies.tube_mpc import TubeMpcPolicy
 
 NEURAL = "lagros_policies.remarks.policies:NeuralTubeMpcPolicy"
 ADAPTIVE = "lagros_policies.remarks.policies:AdaptiveTubeMpcPolicy"
-SLIDING = "lagros_policies.remarks.policies:SlidingCentralizedPolicy"
+SLIDING = "lagros_policies.tasks.spacecraft.sliding:SlidingCentralizedPolicy"
 
 
 @pytest.fixture(scope="module")

@@ -10,17 +10,26 @@ certificate asks for a heading.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_positive
 from lagros_envs.tasks.spacecraft.physics import Spacecraft, check_spacecraft
-from lagros_policies.contraction.double_integrator import AxisMetric, design_axis, flow
+from lagros_policies.contraction.double_integrator import (
+    AxisMetric,
+    certified_margin,
+    design_axis,
+    flow,
+)
 from lagros_policies.tasks.spacecraft.thrusters import held_thrust
 
 FloatArray = NDArray[np.float64]
+# Position and velocity errors (..., a) to the deviation (..., a) from the nominal acceleration.
+Law = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -86,13 +95,13 @@ class HeldBall:
 
 
 @dataclass(frozen=True)
-class WrenchTracking:
-    """u* and its thrusters, for any number of agents at once.
+class AxesTracking:
+    """A law of each axis' error and the thrusters that make it, for any number of agents at once.
 
     Attributes:
         body: The spacecraft.
-        plane: Metric of x and y.
-        turning: Metric of the heading, of the same period.
+        plane: What the law of x and y is made of, with the `period` of its hold.
+        turning: Likewise of the heading, of the same period.
 
     Raises:
         TypeError: The body is no spacecraft.
@@ -100,8 +109,8 @@ class WrenchTracking:
     """
 
     body: Spacecraft
-    plane: AxisMetric
-    turning: AxisMetric
+    plane: Any
+    turning: Any
 
     def __post_init__(self) -> None:
         """Check the periods."""
@@ -111,6 +120,56 @@ class WrenchTracking:
                 f"plane and turning need one period > 0, not {self.plane.period!r} and "
                 f"{self.turning.period!r}"
             )
+
+    @property
+    def laws(self) -> tuple[Law, Law]:
+        """The laws of the plane and of the heading."""
+        raise NotImplementedError
+
+    def margin(self, disturbance_bound: float) -> float:
+        """Return what the position error never exceeds after e(0) = 0 (proved) [m]."""
+        raise NotImplementedError
+
+    def acceleration(
+        self, state: FloatArray, nominal: FloatArray, nominal_acceleration: FloatArray
+    ) -> FloatArray:
+        """Return the acceleration of the law, shape (..., 3) [m/s^2, m/s^2, rad/s^2].
+
+        Args:
+            state: x, shape (..., 6).
+            nominal: x_d, shape (..., 6).
+            nominal_acceleration: Of x, y and heading under u_d, shape (..., 3).
+        """
+        error = state - nominal
+        plane, turning = self.laws
+        straight = plane(error[..., :2], error[..., 3:5])
+        turn = turning(error[..., 2:3], error[..., 5:])
+        value: FloatArray = nominal_acceleration + np.concatenate([straight, turn], axis=-1)
+        return value
+
+    def control(
+        self, state: FloatArray, nominal: FloatArray, nominal_acceleration: FloatArray
+    ) -> FloatArray:
+        """Return the thrust, shape (..., 8), all >= 0 [N]; arguments as of `acceleration`."""
+        wanted = self.acceleration(state, nominal, nominal_acceleration)
+        return held_thrust(self.body, state, wanted, self.plane.period)
+
+
+@dataclass(frozen=True)
+class WrenchTracking(AxesTracking):
+    """u* in the metrics of the plane and of the heading."""
+
+    plane: AxisMetric
+    turning: AxisMetric
+
+    @property
+    def laws(self) -> tuple[Law, Law]:
+        """The laws of the plane and of the heading."""
+        return HeldBall(self.plane), HeldBall(self.turning)
+
+    def margin(self, disturbance_bound: float) -> float:
+        """Return what the position error never exceeds; see `certified_margin`."""
+        return certified_margin(self.plane, disturbance_bound)
 
     @classmethod
     def for_rates(
@@ -131,26 +190,3 @@ class WrenchTracking:
         for name, rate in rates.items():
             check_positive(name, rate)
         return cls(body, design_axis(contraction_rate, period), design_axis(turning_rate, period))
-
-    def acceleration(
-        self, state: FloatArray, nominal: FloatArray, nominal_acceleration: FloatArray
-    ) -> FloatArray:
-        """Return the acceleration of u*, shape (..., 3) [m/s^2, m/s^2, rad/s^2].
-
-        Args:
-            state: x, shape (..., 6).
-            nominal: x_d, shape (..., 6).
-            nominal_acceleration: Of x, y and heading under u_d, shape (..., 3).
-        """
-        error = state - nominal
-        plane = HeldBall(self.plane)(error[..., :2], error[..., 3:5])
-        turn = HeldBall(self.turning)(error[..., 2:3], error[..., 5:])
-        value: FloatArray = nominal_acceleration + np.concatenate([plane, turn], axis=-1)
-        return value
-
-    def control(
-        self, state: FloatArray, nominal: FloatArray, nominal_acceleration: FloatArray
-    ) -> FloatArray:
-        """Return u*, shape (..., 8), all >= 0 [N]; arguments as of `acceleration`."""
-        wanted = self.acceleration(state, nominal, nominal_acceleration)
-        return held_thrust(self.body, state, wanted, self.plane.period)

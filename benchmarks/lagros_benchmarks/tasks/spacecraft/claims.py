@@ -28,10 +28,8 @@ def position_margin(policy: Any, disturbance_bound: float) -> float | None:
             saturate apply another control than the one that the bound is for.
         disturbance_bound: d_bar, in units of the state per second.
     """
-    from lagros_policies.contraction.double_integrator import certified_margin
-    from lagros_policies.remarks.lagrangian import SlidingTracking, steady_position_bound
-    from lagros_policies.remarks.policies import SlidingCentralizedPolicy
     from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
+    from lagros_policies.tasks.spacecraft.sliding import SlidingCentralizedPolicy, SlidingTracking
     from lagros_policies.tasks.spacecraft.wrench_control import WrenchTracking
 
     if type(policy) not in (CentralizedPolicy, SlidingCentralizedPolicy):
@@ -40,8 +38,7 @@ def position_margin(policy: Any, disturbance_bound: float) -> float | None:
         return None
     # The law may have been exchanged, by another of these two.
     law: Any = policy.tracking
-    if type(law) is SlidingTracking:
-        return steady_position_bound(law.plane, disturbance_bound)
-    if type(law) is WrenchTracking:
-        return certified_margin(law.plane, disturbance_bound)
-    return None
+    if type(law) not in (SlidingTracking, WrenchTracking):
+        return None
+    margin: float = law.margin(disturbance_bound)
+    return margin

@@ -8,7 +8,6 @@ the sequence is flown.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,13 +15,10 @@ from numpy.typing import NDArray
 
 from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_policies.contraction.double_integrator import flow
-from lagros_policies.remarks.lagrangian import SlidingTracking
-from lagros_policies.tasks.spacecraft.wrench_control import HeldBall, WrenchTracking
+from lagros_policies.tasks.spacecraft.wrench_control import AxesTracking, Law
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-# Errors of position and velocity along one axis, each (b, 1), to the deviation (b, 1) [m/s^2].
-PlaneLaw = Callable[[FloatArray, FloatArray], FloatArray]
 
 _STEP = 1e-6
 _STEPS = 60
@@ -44,7 +40,7 @@ class PlaneTarget:
         steps: Control steps.
     """
 
-    law: PlaneLaw
+    law: Law
     bound: float
     period: float
     steps: int = _STEPS
@@ -115,21 +111,17 @@ class PlaneTarget:
         return np.stack(errors, axis=1)
 
 
-def plane_target(tracking: WrenchTracking | SlidingTracking, bound: float) -> PlaneTarget:
+def plane_target(tracking: AxesTracking, bound: float) -> PlaneTarget:
     """Return the loop of a tracking law.
 
     Args:
         tracking: u* or the sliding-variable law.
         bound: d_bar, in units of the state per second.
     """
-    if isinstance(tracking, SlidingTracking):
-        return PlaneTarget(tracking.plane.deviation, bound, tracking.plane.period)
-    return PlaneTarget(HeldBall(tracking.plane), bound, tracking.plane.period)
+    return PlaneTarget(tracking.laws[0], bound, tracking.plane.period)
 
 
-def worst_plane_pushes(
-    tracking: WrenchTracking | SlidingTracking, bound: float, steps: int
-) -> FloatArray:
+def worst_plane_pushes(tracking: AxesTracking, bound: float, steps: int) -> FloatArray:
     """Return the d/d_bar of position and velocity that the search finds, shape (steps, 2).
 
     Args:
