@@ -25,12 +25,11 @@ sys.path[:] = [str(HERE.parent), *(entry for entry in sys.path if entry != str(H
 import numpy as np  # noqa: E402
 
 from lagros_envs.files import write_atomic  # noqa: E402
-from lagros_policies.export import NAMES, SpacecraftSource, check, load_source  # noqa: E402
-from lagros_policies.export.c99 import TANHS  # noqa: E402
+from lagros_policies.export import Source, check, exported_names, load_source  # noqa: E402
+from lagros_policies.export.c99 import TANHS, c_file  # noqa: E402
 from lagros_policies.export.cost import footprint  # noqa: E402
-from lagros_policies.export.file import c_file, onnx_file  # noqa: E402
-from lagros_policies.export.source import Source  # noqa: E402
-from lagros_policies.tasks.cartpole.features import cartpole_features  # noqa: E402
+from lagros_policies.export.onnx import onnx_file  # noqa: E402
+from lagros_policies.learning.features import seen  # noqa: E402
 from lagros_policies.tasks.spacecraft.sensed import Sensed  # noqa: E402
 from speed.timing import Candidate, interleave  # noqa: E402
 
@@ -49,7 +48,7 @@ REPEATS = 10
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description="Time an exported C file against NumPy.")
-    parser.add_argument("--policy", default="lagros-cartpole", choices=NAMES)
+    parser.add_argument("--policy", default="lagros-cartpole", choices=exported_names())
     parser.add_argument("--rounds", type=int, default=60)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
@@ -63,7 +62,7 @@ def main() -> None:
 
     def bare(_: int) -> None:
         for row in inputs:
-            source.network(row)
+            source.policy.network(row)
 
     candidates: dict[str, Candidate] = {"NumPy predict": predict, "NumPy bare network": bare}
     if check.has_onnxruntime():
@@ -96,9 +95,9 @@ def main() -> None:
         }
         results.append(figures | sizes.get(name, {}))
     report(results, options.policy)
-    if isinstance(source, SpacecraftSource):
+    if source.program.bodies:
         sensed = [
-            float(np.mean(np.sum(rows[:, source.layout.slices[f"{kind}_mask"]], axis=1)))
+            float(np.mean(np.sum(rows[:, source.policy.layout.slices[f"{kind}_mask"]], axis=1)))
             for kind in ("neighbour", "obstacle")
         ]
         print("On average {:.1f} neighbours and {:.1f} obstacles are sensed.".format(*sensed))
@@ -108,15 +107,15 @@ def main() -> None:
 
 def features(source: Source, rows: Any) -> list[Any]:
     """Return the inputs of the network for each observation."""
-    if isinstance(source, SpacecraftSource):
-        layout = source.layout
+    if source.program.bodies:
+        layout = source.policy.layout
         return [source.policy.features(Sensed.of(layout, row)) for row in rows]
-    return list(cartpole_features(rows)[0])
+    return list(seen(source.policy.see, rows)[0])
 
 
 def texts(source: Source) -> dict[str, str]:
     """Return the C files of a policy, by what tells them apart."""
-    if isinstance(source, SpacecraftSource):
+    if not source.program.tanh:
         return {"": c_file(source)}
     return {f"tanh {tanh}, ": c_file(source, tanh) for tanh in TANHS}  # type: ignore[arg-type]
 

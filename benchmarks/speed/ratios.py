@@ -315,25 +315,24 @@ def _predict(scale: Scale) -> Duel | Row:
 
 def _export(scale: Scale) -> list[Duel | Row]:
     from lagros_policies.export import check, load_source
-    from lagros_policies.export.c99 import c_source
-    from lagros_policies.export.source import example_observations
-    from lagros_policies.tasks.cartpole.features import cartpole_features
+    from lagros_policies.export.c99 import c_file
+    from lagros_policies.learning.features import seen
 
     if check.compiler() is None:
         return [absent_row("C export, one call", "gcc")]
     source = load_source("lagros-cartpole")
-    rows = example_observations(_EXPORT_CALLS)
-    features = cartpole_features(rows)[0]
+    rows = source.examples(_EXPORT_CALLS)
+    features = seen(source.policy.see, rows)[0]
     flags = ("-std=c99", "-O3", "-march=native", "-ffp-contract=fast")
     # About as long as NumPy's part: the first call of a round finds its weights out of the near
     # caches, and has to count alike for both.
     repeats = 10
-    with check.CompiledPolicy(c_source(source), source, flags) as exported:
+    with check.CompiledPolicy(c_file(source), source, flags) as exported:
         times = interleave(
             {
-                "C": lambda _: [exported.force(rows) for _ in range(repeats)],
+                "C": lambda _: [exported.answer(rows) for _ in range(repeats)],
                 "predict": lambda _: [source.policy.predict(row) for row in rows],
-                "forward": lambda _: [source.network(row) for row in features],
+                "forward": lambda _: [source.policy.network(row) for row in features],
             },
             scale.rounds,
         )

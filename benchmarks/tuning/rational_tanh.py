@@ -18,7 +18,7 @@ import argparse
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_policies.export.c99 import TANH_ERROR, TANH_LIMIT, TANH_P, TANH_Q
+from lagros_policies.export.c_layers import TANH_ERROR, TANH_LIMIT, TANH_P, TANH_Q
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]

@@ -44,6 +44,9 @@ IMPORTS = "from math import cos, exp, sin, sqrt, tan"
 # (x, u, given, functions) -> what else to compute from the state at the end of a step.
 Measure = Callable[[Sequence[Any], Sequence[Any], Sequence[Any], Any], Sequence[Any]]
 
+# (operation, its operands as expressions) -> the expression in some language.
+Write = Callable[[Operation, Sequence[str]], str]
+
 
 class StraightLine(NamedTuple):
     """A function as a list of operations.
@@ -203,11 +206,16 @@ def scalar_source(
     )
 
 
-def statements(step: StraightLine) -> tuple[list[str], list[str]]:
+def statements(step: StraightLine, write: Write | None = None) -> tuple[list[str], list[str]]:
     """Return the operations as assignments, and the outputs as expressions.
 
     What is used once is written where it is used: it never becomes a variable.
+
+    Args:
+        step: The operations.
+        write: Writes one, on operands that are expressions; as Python if None.
     """
+    write = write or expression
     counts: dict[str, int] = {}
     for used in [*(one.operands for one in step.operations.values()), step.outputs]:
         for operand in used:
@@ -215,7 +223,7 @@ def statements(step: StraightLine) -> tuple[list[str], list[str]]:
     lines: list[str] = []
     texts: dict[str, str] = {}
     for place, (name, operation) in enumerate(step.operations.items()):
-        text = expression(operation, [texts.get(one, one) for one in operation.operands])
+        text = write(operation, [texts.get(one, one) for one in operation.operands])
         if counts.get(name, 0) > 1:
             lines.append(f"v{place} = {text}")
             text = f"v{place}"

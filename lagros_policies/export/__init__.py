@@ -1,9 +1,8 @@
 """Policies as files for other machines: an ONNX model or one C99 file.
 
-Both map what a policy (a) or (c) observes of the cart-pole or the spacecraft to forces in newtons,
-features included.
+Both map what a policy that is a network observes to controls in their own units, features included.
 """
 
-from lagros_policies.export.source import NAMES, NetworkSource, SpacecraftSource, load_source
+from lagros_policies.export.source import Source, exported_names, load_source
 
-__all__ = ["NAMES", "NetworkSource", "SpacecraftSource", "load_source"]
+__all__ = ["Source", "exported_names", "load_source"]

@@ -1,40 +1,97 @@
-"""A cart-pole policy as one C99 file: weights, features, mirror, no dependency but `tanhf`."""
+"""A policy as one C99 file: features, network and what its outputs stand for, in float.
+
+No dependency but the functions of <math.h> that the features call. Bodies that are sensed are taken
+one after the other and added up, so that their number has no limit and costs no memory.
+"""
 
 from __future__ import annotations
 
+import re
+import textwrap
+from collections.abc import Iterator, Sequence
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.dynamics.straight_line import StraightLine, statements
+from lagros_envs.numbers.recorded import Operation
 from lagros_policies.export.c_layers import (
     TANH_ERROR,
-    TANH_LIMIT,
-    TANH_P,
-    TANH_Q,
     Activation,
     array,
     layer,
+    literal,
     rational_tanh_source,
 )
-from lagros_policies.export.source import NetworkSource, example_observations
+from lagros_policies.export.program import Bodies, Layers, Program
+from lagros_policies.export.source import Source
 
-__all__ = ["TANHS", "TANH_ERROR", "TANH_LIMIT", "TANH_P", "TANH_Q", "Tanh", "c_source"]
+__all__ = ["TANHS", "Tanh", "c_file", "observation_call"]
 
-Float32Array = NDArray[np.float32]
 Tanh = Literal["rational", "libm"]
 TANHS: tuple[str, ...] = get_args(Tanh)
 
 _SAMPLES = 8  # of the self-test
+_NUMBER = re.compile(r"-?\d")
+_HEADER = """/*
+ * {name}: a policy as a function. C99, one file, no heap, no state.
+ *
+{signatures}
+ *
+{texts}
+ *
+ * A NaN in any number that is read, a mask included, is answered by NaN; compile without
+ * -ffast-math and -Ofast, which take it that there is none.
+{notes}
+ * Weights: {file}, SHA-256
+ *     {digest}
+ * Self-test: cc -std=c99 -O2 -DLAGROS_SELF_TEST THIS_FILE -lm && ./a.out
+ * Written by `lagros export`; do not edit.
+ */
+#include <math.h>
+
+{declarations}"""
+_SELF_TEST = """#ifdef LAGROS_SELF_TEST
+#include <stdio.h>
+
+/* Answers by NumPy; single precision and another order of summation move the last digits. */
+{observations}
+{answers}
+#define TOLERANCE {tolerance} /* 1e-5 of the largest */
+
+int main(void)
+{{
+    int i, j, failures = 0;
+    for (i = 0; i < {count}; i++) {{
+        float control[{size}];
+        int agrees = 1;
+        {call};
+        for (j = 0; j < {size}; j++) {{
+            const float wanted = test_answers[{size} * i + j];
+            const float error = control[j] > wanted ? control[j] - wanted : wanted - control[j];
+            /* Written so that a NaN fails. */
+            if (!(error <= TOLERANCE)) {{
+                printf("case %d, control %d: %.7g, wanted %.7g\\n", i, j, (double)control[j],
+                       (double)wanted);
+                agrees = 0;
+            }}
+        }}
+        failures += !agrees;
+    }}
+    printf("%d of {count} cases agree\\n", {count} - failures);
+    return failures != 0;
+}}
+#endif
+"""
 
 
-def c_source(source: NetworkSource, tanh: Tanh = "rational") -> str:
+def c_file(source: Source, tanh: Tanh = "rational") -> str:
     """Return the C99 file of a policy.
 
-    It defines `float NAME_force(state, goal, initial_state, time)` and
-    `float NAME_observation(observation)`, both [N], with NAME the policy's, and with
-    -DLAGROS_SELF_TEST a `main` that compares with stored forces. Weights are `static const float`;
-    nothing is allocated, nothing is kept between calls.
+    It defines a function of the parts of an observation and `NAME_observation`, of an observation
+    as it is, with NAME the policy's, and with -DLAGROS_SELF_TEST a `main` that compares with stored
+    answers. Weights are `static const float`; nothing is allocated or kept between calls. One
+    control is returned, several are written.
 
     Args:
         source: The policy.
@@ -46,130 +103,249 @@ def c_source(source: NetworkSource, tanh: Tanh = "rational") -> str:
     """
     if tanh not in TANHS:
         raise ValueError(f"tanh={tanh!r} must be one of {', '.join(TANHS)}")
-    name = source.name.replace("-", "_")
-    parts = [
-        _header(source, name, tanh),
-        _network(source, tanh),
-        _interface(name),
-        _self_test(source, name),
-    ]
-    return "\n".join(parts)
-
-
-def _header(source: NetworkSource, name: str, tanh: Tanh) -> str:
-    shape = "-".join(str(width) for width in _widths(source))
-    libm = (
-        "tanhf of libm: link with -lm"
-        if tanh == "libm"
-        else f"rational, within {TANH_ERROR:.0e} of tanh, relative; no library"
+    program = source.program
+    rational = tanh == "rational" and program.tanh and len(program.layers) > 1
+    hidden: Activation = tanh if program.tanh else "relu"
+    return "\n".join(
+        [
+            _header(source, tanh),
+            *([rational_tanh_source()] if rational else []),
+            *_network("network", program.layers, hidden, "none"),
+            *(part for kind in program.bodies for part in _see(program, kind)),
+            *_answer(program),
+            *_interface(source),
+            _self_test(source),
+        ]
     )
-    return f"""/*
- * {source.name}: the force of a cart-pole policy. C99, one file, no heap, no state.
- *
- *     float {name}_force(const float state[4], const float goal[4],
- *                        const float initial_state[4], float time);
- *     float {name}_observation(const float observation[13]);
- *
- * state          x = [position m, angle rad, velocity m/s, angular rate rad/s], angle 0 upright
- * goal           x_f, the same units; only its position is read
- * initial_state  x(0) of the episode; only its position and angle are read
- * time           since the start of the episode [s]
- * observation    the four above in a row, as lagros/CartPole-v0 gives them
- * returns        the force on the cart [N], not saturated; hold it for one control step of 0.1 s.
- *                A NaN in any number that is read makes it NaN; compile without -ffast-math and
- *                -Ofast, which take it that there is none
- *
- * Network: {shape}, tanh between the layers. tanh: {libm}.
- * Weights: {source.file}, SHA-256
- *     {source.digest}
- * Self-test: cc -std=c99 -O2 -DLAGROS_SELF_TEST THIS_FILE -lm && ./a.out
- * Written by `lagros export`; do not edit.
- */
-float {name}_force(const float state[4], const float goal[4],
-                   const float initial_state[4], float time);
-float {name}_observation(const float observation[13]);
-"""
 
 
-def _network(source: NetworkSource, tanh: Tanh) -> str:
-    network = source.network
-    last = len(network.weights) - 1
-    names = ["features", *(f"hidden{index}" for index in range(last)), "force"]
-    layers, memory, calls = [], [], []
-    for index, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
-        activation: Activation = "none" if index == last else tanh
-        layers.append(layer(f"layer{index}", weight, bias, activation))
-        calls.append(f"    layer{index}({names[index]}, {names[index + 1]});")
-        memory.append(f"    float {names[index + 1]}[{len(bias)}];")
-    head = "#include <math.h>\n" if tanh == "libm" else rational_tanh_source()
-    lines = [
-        *([head] if last else []),
-        *layers,
-        "static float network(const float *features)",
-        "{",
-        *memory,
-        *calls,
-        "    return force[0];",
-        "}",
-        "",
+def observation_call(source: Source, row: str, answers: str) -> str:
+    """Return the C statement that answers an observation, without its semicolon.
+
+    Args:
+        source: The policy.
+        row: The observation, an expression.
+        answers: Where the controls go, a pointer.
+    """
+    arguments = [row, *(str(kind.slots) for kind in source.program.bodies)]
+    function = f"{source.identifier}_observation"
+    if _returns(source.program):
+        return f"*({answers}) = {function}({', '.join(arguments)})"
+    return f"{function}({', '.join([*arguments, answers])})"
+
+
+def _header(source: Source, tanh: Tanh) -> str:
+    program = source.program
+    order = "; then the places for bodies of each kind and their mask" if program.bodies else ""
+    texts = [
+        *((part.name, part.text) for part in program.parts),
+        *((f"{one.name}s", f"of each, in any order: {one.each.text}") for one in program.bodies),
+        ("observation", f"all of it in a row, as the environment gives it{order}"),
+        ("returns" if _returns(program) else program.control.name, program.control.text),
     ]
-    return "\n".join(lines)
+    between = "ReLU"
+    if program.tanh and tanh == "libm":
+        between = "tanhf of libm (link with -lm)"
+    elif program.tanh:
+        between = f"a tanh that is rational, within {TANH_ERROR:.0e} of tanh, relative"
+    shapes = [("the network", program.layers), *((one.name, one.layers) for one in program.bodies)]
+    widths = "; ".join(f"{name} {_widths(layers)}" for name, layers in shapes)
+    notes = (*program.notes, f"Layers: {widths}; between them {between}.")
+    declarations = "".join(f"{head};\n" for head in _signatures(source))
+    return _HEADER.format(
+        name=source.name,
+        signatures=textwrap.indent(declarations.rstrip(), " *     "),
+        texts="\n".join(_comment(f"{name}: {text}") for name, text in texts),
+        notes="\n".join(map(_comment, notes)),
+        file=source.file,
+        digest=source.digest,
+        declarations=declarations,
+    )
 
 
-def _interface(name: str) -> str:
-    return f"""float {name}_force(const float state[4], const float goal[4],
-                   const float initial_state[4], float time)
-{{
-    /* An episode that starts leaning left is the mirror image of one that starts leaning right. */
-    const float side = initial_state[1] < 0.0f ? -1.0f : 1.0f;
-    float features[7];
-    features[0] = side * (state[0] - goal[0]);
-    features[1] = side * state[1];
-    features[2] = side * state[2];
-    features[3] = side * state[3];
-    features[4] = side * (goal[0] - initial_state[0]);
-    features[5] = side * initial_state[1];
-    features[6] = time;
-    return side * network(features);
-}}
-
-float {name}_observation(const float observation[13])
-{{
-    return {name}_force(observation, observation + 4, observation + 8, observation[12]);
-}}
-"""
+def _comment(text: str) -> str:
+    return textwrap.fill(text, 98, initial_indent=" * ", subsequent_indent=" *     ")
 
 
-def _self_test(source: NetworkSource, name: str) -> str:
-    observations = example_observations(_SAMPLES)
-    forces = source.force(observations)
-    return f"""#ifdef LAGROS_SELF_TEST
-#include <stdio.h>
-
-/* Forces by NumPy in float32; another order of summation moves them in the last digits. */
-{array("test_observations", observations)}
-{array("test_forces", forces)}
-int main(void)
-{{
-    int i, failures = 0;
-    for (i = 0; i < {_SAMPLES}; i++) {{
-        const float force = {name}_observation(test_observations + 13 * i);
-        const float wanted = test_forces[i];
-        const float error = force > wanted ? force - wanted : wanted - force;
-        const float size = wanted < 0.0f ? -wanted : wanted;
-        /* Written so that a NaN fails. */
-        if (!(error <= 1e-5f * (1.0f + size))) {{
-            printf("case %d: %.7g N, wanted %.7g N\\n", i, (double)force, (double)wanted);
-            failures++;
-        }}
-    }}
-    printf("%d of {_SAMPLES} cases agree\\n", {_SAMPLES} - failures);
-    return failures != 0;
-}}
-#endif
-"""
+def _widths(layers: Layers) -> str:
+    return "-".join(str(width) for width in [len(layers[0][0]), *(len(bias) for _, bias in layers)])
 
 
-def _widths(source: NetworkSource) -> list[int]:
-    network = source.network
-    return [network.inputs, *(len(bias) for bias in network.biases)]
+def _returns(program: Program) -> bool:
+    return program.control.size == 1
+
+
+def _signatures(source: Source) -> tuple[str, str]:
+    """Return the heads of the two functions that are called from outside."""
+    program, control = source.program, source.program.control
+    written = [] if _returns(program) else [f"float {control.name}[{control.size}]"]
+    counted = [f"const float *{one.name}s, int {one.name}_count" for one in program.bodies]
+    slots = [f"int {one.name}_slots" for one in program.bodies]
+    flat = "*observation" if slots else f"observation[{program.inputs}]"
+    head = f"{'float' if _returns(program) else 'void'} {source.identifier}"
+    return (
+        _head(f"{head}_{control.name}", [*_own(program), *counted, *written]),
+        _head(f"{head}_observation", [f"const float {flat}", *slots, *written]),
+    )
+
+
+def _own(program: Program) -> list[str]:
+    """Return the parameters of the parts of an observation."""
+    return [
+        f"const float {part.name}[{part.size}]" if part.size else f"float {part.name}"
+        for part in program.parts
+    ]
+
+
+def _network(name: str, layers: Layers, hidden: Activation, final: Activation) -> Iterator[str]:
+    """Yield the layers and a function that runs through them."""
+    last = len(layers) - 1
+    between = ["input", *(f"hidden{index}" for index in range(last)), "output"]
+    memory, calls = [], []
+    for index, (weight, bias) in enumerate(layers):
+        yield layer(f"{name}{index}", weight, bias, final if index == last else hidden)
+        calls.append(f"{name}{index}({between[index]}, {between[index + 1]});")
+        if index < last:
+            memory.append(f"float {between[index + 1]}[{len(bias)}];")
+    head = f"static void {name}(const float *restrict input, float *restrict output)"
+    yield _function(head, [*memory, *calls])
+
+
+def _see(program: Program, kind: Bodies) -> Iterator[str]:
+    """Yield the layers of a kind of body and what adds one body to the input of the network."""
+    yield from _network(f"{kind.name}_layer", kind.layers, "relu", "relu")
+    line = program.seeing(kind)
+    features = [f"feature[{index}]" for index in range(len(line.outputs) - 1)]
+    yield _function(
+        f"static void see_{kind.name}(const float *{kind.name}, const float *context, float *sum)",
+        [
+            f"float feature[{len(features)}], seen[{kind.width}], weight;",
+            "int i;",
+            *_lines(line, [*features, "weight"]),
+            f"{kind.name}_layer(feature, seen);",
+            f"for (i = 0; i < {kind.width}; i++)",
+            "    sum[i] += weight * seen[i];",
+        ],
+    )
+
+
+def _answer(program: Program) -> Iterator[str]:
+    """Yield what does it all, from the parts of an observation and the bodies to the controls."""
+    control, looking, acting = program.control, program.looking, program.acting
+    inputs, made, end = len(program.layers[0][0]), control.name, []
+    own = inputs - sum(kind.width for kind in program.bodies)
+    arrays = {"input": inputs, "context": len(program.contexts)}
+    arrays["output"] = len(program.layers[-1][1])
+    if program.last is not None:
+        yield layer("last", program.last, np.zeros(control.size, np.float32), "relu")
+        made, arrays["made"], end = "made", len(acting.outputs), [f"last(made, {control.name});"]
+    walks, place = [], own
+    for kind in program.bodies:
+        mask = f"{kind.name}_mask"
+        walks += [
+            f"for (i = 0; i < {kind.name}_count; i++)",
+            f"    if (!{mask} || {mask}[i] > 0.0f)",
+            f"        see_{kind.name}("
+            f"{kind.name}s + {kind.each.size} * i, context, input + {place});",
+            "    else /* Zero times the mask: a NaN there must not hide a body. */",
+            f"        input[{own}] += 0.0f * {mask}[i];",
+        ]
+        place += kind.width
+    if walks:
+        walks[:0] = [f"for (i = {own}; i < {inputs}; i++)", "    input[i] = 0.0f;"]
+    masked = [
+        f"const float *{one.name}s, const float *{one.name}_mask, int {one.name}_count"
+        for one in program.bodies
+    ]
+    read = {*looking.last_uses}
+    yield _function(
+        _head("static void answer", [*_own(program), *masked, f"float {control.name}[]"]),
+        [
+            "float " + ", ".join(f"{name}[{size}]" for name, size in arrays.items() if size) + ";",
+            *(["int i;"] if walks else []),
+            *(f"(void){part.name};" for part in program.parts if read.isdisjoint(part.places)),
+            *_block(looking, [*(f"input[{index}]" for index in range(own)), *program.contexts]),
+            *walks,
+            "network(input, output);",
+            *_block(acting, [f"{made}[{index}]" for index in range(len(acting.outputs))]),
+            *end,
+        ],
+    )
+
+
+def _interface(source: Source) -> Iterator[str]:
+    """Yield the two functions that are called from outside."""
+    program, name = source.program, source.program.control.name
+    given = [part.name for part in program.parts]
+    given += [f"{one.name}s, 0, {one.name}_count" for one in program.bodies]
+    taken, pointers, begin = [], [], 0
+    for part in program.parts:
+        taken.append(f"observation + {begin}" if part.size else f"observation[{begin}]")
+        begin += part.size or 1
+    at = f"observation + {begin}"
+    for one in program.bodies:
+        some, mask, slots = f"{one.name}s", f"{one.name}_mask", f"{one.name}_slots"
+        pointers += [
+            f"const float *{some} = {at};",
+            f"const float *{mask} = {some} + {one.each.size} * {slots};",
+        ]
+        at = f"{mask} + {slots}"
+        taken.append(f"{some}, {mask}, {slots}")
+    first, end = ([f"float {name}[1];"], [f"return {name}[0];"]) if _returns(program) else ([], [])
+    for head, begun, each in zip(_signatures(source), ([], pointers), (given, taken), strict=True):
+        yield _function(head, [*begun, *first, f"answer({', '.join([*each, name])});", *end])
+
+
+def _self_test(source: Source) -> str:
+    observations = source.examples(_SAMPLES)
+    answers = source.answer(observations)
+    row = f"test_observations + {observations.shape[1]} * i"
+    return _SELF_TEST.format(
+        observations=array("test_observations", observations),
+        answers=array("test_answers", answers),
+        tolerance=literal(1e-5 * float(np.max(np.abs(answers)))),
+        count=_SAMPLES,
+        size=answers.shape[1],
+        call=observation_call(source, row, "control"),
+    )
+
+
+def _block(line: StraightLine, targets: Sequence[str]) -> list[str]:
+    return ["{", *(f"    {one}" for one in _lines(line, targets)), "}"]
+
+
+def _lines(line: StraightLine, targets: Sequence[str]) -> list[str]:
+    """Return recorded operations as C statements that end with assignments to the targets."""
+    steps, outputs = statements(line, _expression)
+    assigned = zip(targets, map(_operand, outputs), strict=True)
+    return [
+        *(f"const float {step};" for step in steps),
+        *(f"{target} = {output};" for target, output in assigned),
+    ]
+
+
+def _expression(operation: Operation, operands: Sequence[str]) -> str:
+    """Return an operation on expressions."""
+    texts = [_operand(one) for one in operands]
+    if operation.symbol == "where":
+        return f"({texts[0]} ? {texts[1]} : {texts[2]})"
+    if operation.symbol == "abs":
+        return f"fabsf({texts[0]})"
+    if len(texts) == 1:
+        return f"{operation.symbol}f({texts[0]})"
+    symbol = "&&" if operation.symbol == "&" else operation.symbol
+    return f"({texts[0]} {symbol} {texts[1]})"
+
+
+def _operand(text: str) -> str:
+    return literal(float(text)) if _NUMBER.match(text) else text
+
+
+def _head(name: str, parameters: Sequence[str]) -> str:
+    """Return the head of a function, in several lines where it is long."""
+    text = f"{name}({', '.join(parameters)})"
+    return text if len(text) < 92 else f"{name}(\n    " + ",\n    ".join(parameters) + ")"
+
+
+def _function(head: str, lines: Sequence[str]) -> str:
+    return "\n".join([head, "{", *(f"    {line}" for line in lines), "}", ""])

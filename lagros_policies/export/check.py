@@ -16,11 +16,12 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_policies.export.source import Source, SpacecraftSource
+from lagros_policies.export.c99 import observation_call
+from lagros_policies.export.onnx import INSTALL
+from lagros_policies.export.source import Source
 
 Float32Array = NDArray[np.float32]
 
-INSTALL = 'pip install "lagros[onnx]"'
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 # Called with many observations, so that the time of a call from Python does not count.
 _MANY = """
@@ -48,7 +49,7 @@ class CompiledPolicy:
     """The C file of a policy as a function, compiled into a temporary folder.
 
     Args:
-        text: The file, from `c_source` or `spacecraft_source`.
+        text: The file, from `c_file`.
         source: The policy that it was made of.
         flags: Flags of the compiler, beside those for a shared library.
 
@@ -66,14 +67,16 @@ class CompiledPolicy:
             raise FileNotFoundError("no C compiler (gcc, cc) is on the path; install one")
         self._folder = tempfile.TemporaryDirectory(prefix="lagros-export-")
         folder = Path(self._folder.name)
+        inputs, outputs = source.program.inputs, source.program.control.size
         code, library = folder / "policy.c", folder / "policy.so"
-        code.write_text(text + _MANY.format(call=_call(source)))
+        call = observation_call(source, f"observations + {inputs} * i", f"answers + {outputs} * i")
+        code.write_text(text + _MANY.format(call=call))
         command = [tool, *flags, "-shared", "-fPIC", str(code), "-o", str(library), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             self.close()
             raise RuntimeError(f"{tool} refuses the exported file:\n{done.stderr}")
-        self._inputs, self._outputs = source.inputs, source.outputs
+        self._inputs, self._outputs = inputs, outputs
         self._many = ctypes.CDLL(str(library)).many
         self._many.restype = None
         self._many.argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p]
@@ -94,7 +97,7 @@ class CompiledPolicy:
         self._folder.cleanup()
 
     def answer(self, observation: Float32Array) -> Float32Array:
-        """Return the forces [N], shape (B, outputs), of observations (B, o), one C call each."""
+        """Return the controls, shape (B, m), of observations (B, o), one C call each."""
         rows = np.ascontiguousarray(observation, np.float32)
         if rows.ndim != 2 or rows.shape[1] != self._inputs:
             raise ValueError(f"observation has shape {rows.shape}; it must be (B, {self._inputs})")
@@ -102,23 +105,9 @@ class CompiledPolicy:
         self._many(rows.ctypes.data, len(rows), answers.ctypes.data)
         return answers
 
-    def force(self, observation: Float32Array) -> Float32Array:
-        """Return the force [N] of the cart-pole, shape (B,), of observations (B, 13)."""
-        return self.answer(observation)[:, 0]
-
-
-def _call(source: Source) -> str:
-    """Return the C call that answers the i-th observation."""
-    function = f"{source.name.replace('-', '_')}_observation"
-    row = f"observations + {source.inputs} * i"
-    if isinstance(source, SpacecraftSource):
-        slots = f"{source.layout.neighbours}, {source.layout.obstacles}"
-        return f"{function}({row}, {slots}, answers + {source.outputs} * i)"
-    return f"answers[i] = {function}({row})"
-
 
 def onnx_function(model: bytes) -> Callable[[Float32Array], Float32Array]:
-    """Return ONNX Runtime's function of a model, on one thread: observations (B, o) to forces [N].
+    """Return ONNX Runtime's function of a model, on one thread: observations (B, o) to controls.
 
     Raises:
         ImportError: ONNX Runtime is not installed.
@@ -132,20 +121,15 @@ def onnx_function(model: bytes) -> Callable[[Float32Array], Float32Array]:
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
     def answer(observation: Float32Array) -> Float32Array:
-        forces: Float32Array = session.run(None, {"observation": observation})[0]
-        return forces
+        controls: Float32Array = session.run(None, {"observation": observation})[0]
+        return controls
 
     return answer
 
 
 def onnx_answer(model: bytes, observation: Float32Array) -> Float32Array:
-    """Return the forces [N], shape (B, outputs), of observations (B, o); see `onnx_function`."""
+    """Return the controls, shape (B, m), of observations (B, o); see `onnx_function`."""
     return onnx_function(model)(observation)
-
-
-def onnx_force(model: bytes, observation: Float32Array) -> Float32Array:
-    """Return the force [N] of the cart-pole, shape (B,), as `onnx_answer`."""
-    return onnx_answer(model, observation)[:, 0]
 
 
 @dataclass(frozen=True)
@@ -153,29 +137,29 @@ class Agreement:
     """How far an export is from NumPy over some observations.
 
     Attributes:
-        largest_difference: Largest |u - u_NumPy| [N]; NaN where a force is NaN.
-        largest_force: Largest |u_NumPy| [N].
+        largest_difference: Largest |u - u_NumPy|; NaN where a control is NaN.
+        largest: Largest |u_NumPy|.
     """
 
     largest_difference: float
-    largest_force: float
+    largest: float
 
     @property
     def relative(self) -> float:
-        """The largest difference in units of the largest force.
+        """The largest difference in units of the largest control.
 
-        Near a force of zero float32 cannot do better: terms of that size cancel.
+        Near zero float32 cannot do better: terms of that size cancel.
         """
-        return self.largest_difference / self.largest_force
+        return self.largest_difference / self.largest
 
     def __str__(self) -> str:
-        return f"{self.largest_difference:.1e} N at forces up to {self.largest_force:.1f} N"
+        return f"{self.largest_difference:.1e}, of controls up to {self.largest:.3g}"
 
 
 def agreement(answers: Float32Array, source: Source, observation: Float32Array) -> Agreement:
-    """Compare forces (B, outputs), or (B,) of one, [N] with the NumPy policy's for (B, o)."""
+    """Compare controls (B, m) with the NumPy policy's for (B, o)."""
     wanted = source.answer(observation).astype(np.float64)
-    difference = np.abs(answers.reshape(wanted.shape) - wanted)
+    difference = np.abs(answers - wanted)
     return Agreement(float(np.max(difference)), float(np.max(np.abs(wanted))))
 
 

@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 from lagros_benchmarks.commands import cli
 from lagros_policies.export import check, load_source
 from lagros_policies.export.cost import footprint
-from lagros_policies.export.source import example_observations
 from lagros_policies.learning.networks import Mlp
 
 
@@ -32,9 +31,9 @@ def test_c_is_written_under_the_name_of_the_policy(invoke, tmp_path):
     assert source.digest in result.stdout
     text = (tmp_path / "learned_cartpole.c").read_text()
     assert "rational_tanh" in text
-    rows = example_observations(50)
+    rows = source.examples(50)
     with check.CompiledPolicy(text, source) as compiled:
-        np.testing.assert_allclose(compiled.force(rows), source.force(rows), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(compiled.answer(rows), source.answer(rows), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
@@ -48,7 +47,7 @@ def test_time_and_bytes_of_c_are_told(invoke, tmp_path, policy):
     code, ram, stack = map(
         int, re.search(r"weights (\d+) B, RAM (\d+) B, stack at most (\d+) B", told).groups()
     )
-    network = load_source(policy).network
+    network = load_source(policy).policy.network
     parts = (
         [network.weights, network.biases]
         if policy == "lagros-cartpole"
@@ -126,9 +125,9 @@ def test_onnx_of_own_weights_is_written_where_asked(invoke, tmp_path):
     )
     assert result.exit_code == 0, result.output
     source = load_source("lagros-cartpole", tmp_path / "own.safetensors")
-    rows = example_observations(50)
-    forces = check.onnx_force((tmp_path / "a" / "b.onnx").read_bytes(), rows)
-    np.testing.assert_allclose(forces, source.force(rows), rtol=1e-5, atol=1e-5)
+    rows = source.examples(50)
+    forces = check.onnx_answer((tmp_path / "a" / "b.onnx").read_bytes(), rows)
+    np.testing.assert_allclose(forces, source.answer(rows), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["c", "onnx"])
@@ -161,8 +160,11 @@ def test_a_file_that_disagrees_is_not_written(invoke, tmp_path, monkeypatch, dif
         (("lagros-cartpole", "--tanh", "fast"), "--tanh: 'fast' must be one of rational, libm"),
         (("lagros-cartpole", "--format", "onnx", "--tanh", "rational"), "leave it out for onnx"),
         (("lagros-cartpole", "--weights", "none.safetensors"), "there is no file none.safetensors"),
-        (("lagros-cartpole", "--agents", "3"), "leave them out for the cart-pole"),
-        (("lagros-spacecraft", "--tanh", "libm"), "the spacecraft's network has no tanh"),
+        (
+            ("lagros-cartpole", "--agents", "3"),
+            "cartpole is one body: --preset",
+        ),
+        (("lagros-spacecraft", "--tanh", "libm"), "the network of lagros-spacecraft has no tanh"),
         (("lagros-spacecraft", "--preset", "moon"), "preset='moon' is not known"),
         (("lagros-spacecraft", "--agents", "0"), "num_agents=0 must be a whole number"),
         (

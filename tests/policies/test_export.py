@@ -9,14 +9,20 @@ import pytest
 
 from lagros_envs.tasks.cartpole import task
 from lagros_policies.export import check, load_source
-from lagros_policies.export.c99 import TANH_ERROR, TANHS, c_source
-from lagros_policies.export.onnx import network_model, policy_model
-from lagros_policies.export.source import CARTPOLE_NAMES, example_observations
+from lagros_policies.export.c99 import TANHS, c_file
+from lagros_policies.export.c_layers import TANH_ERROR
+from lagros_policies.export.onnx import network_model, onnx_file
+from lagros_policies.export.single import example_observations
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.room import PRETRAINED
 
 needs_compiler = pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
+CARTPOLE_NAMES = ("lagros-cartpole", "learned-cartpole")
 needs_onnx = pytest.mark.skipif(not check.has_onnxruntime(), reason="no onnxruntime")
+
+
+def examples(count, seed=0):
+    return example_observations(task.CartPoleSettings(), count, seed)
 
 
 def by_hand(network, observation):
@@ -32,7 +38,7 @@ def by_hand(network, observation):
             layer = layer @ weight.astype(float) + bias
             if index < len(network.weights) - 1:
                 layer = np.tanh(layer)
-        forces.append(mirror * layer[0])
+        forces.append(mirror * layer)
     return np.array(forces)
 
 
@@ -47,7 +53,7 @@ def save_network(path, widths, seed=0):
 
 @pytest.fixture(scope="module")
 def observations():
-    rows = example_observations(400)
+    rows = examples(400)
     # Both sides, an upright start (which is no left start), and a start away from the origin.
     assert 100 < np.sum(rows[:, 9] < 0) < 300
     rows[0, 9] = 0.0
@@ -61,25 +67,27 @@ def observations():
 @pytest.mark.parametrize("name", CARTPOLE_NAMES)
 def test_c_equals_numpy_and_the_definition(name, tanh, observations):
     source = load_source(name)
-    with check.CompiledPolicy(c_source(source, tanh), source) as compiled:
-        forces = compiled.force(observations)
-    wanted = source.force(observations)
+    with check.CompiledPolicy(c_file(source, tanh), source) as compiled:
+        forces = compiled.answer(observations)
+    wanted = source.answer(observations)
     np.testing.assert_allclose(forces, wanted, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(forces, by_hand(source.network, observations), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(
+        forces, by_hand(source.policy.network, observations), rtol=1e-5, atol=1e-5
+    )
     # The force is in newtons: the action of the task times its scale.
     settings = task.CartPoleSettings()
     action, _ = type(source.policy)(settings, allow_other_settings=True).predict(observations)
-    np.testing.assert_allclose(forces, settings.force_scale * action[:, 0], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(forces, settings.force_scale * action, rtol=1e-5, atol=1e-5)
 
 
 @needs_compiler
 @pytest.mark.parametrize("widths", [(), (3,), (32, 17), (13, 40, 24), (1, 20)])
 def test_c_of_any_network(tmp_path, widths, observations):
     source = load_source("lagros-cartpole", save_network(tmp_path / "own.safetensors", widths))
-    wanted = by_hand(source.network, observations)
+    wanted = by_hand(source.policy.network, observations)
     for tanh in TANHS:
-        with check.CompiledPolicy(c_source(source, tanh), source) as compiled:
-            forces = compiled.force(observations)
+        with check.CompiledPolicy(c_file(source, tanh), source) as compiled:
+            forces = compiled.answer(observations)
         np.testing.assert_allclose(forces, wanted, rtol=1e-5, atol=1e-5)
 
 
@@ -87,8 +95,8 @@ def test_c_of_any_network(tmp_path, widths, observations):
 @pytest.mark.parametrize("tanh", TANHS)
 def test_the_self_test_passes_and_can_fail(tmp_path, tanh):
     source = load_source("learned-cartpole")
-    text = c_source(source, tanh)
-    spoiled = text.replace("features[6] = time;", "features[6] = time + 0.01f;")
+    text = c_file(source, tanh)
+    spoiled = text.replace("input[6] = time;", "input[6] = time + 0.01f;")
     assert spoiled != text
     for case, status in ((text, 0), (spoiled, 1)):
         code, program = tmp_path / "policy.c", tmp_path / "policy"
@@ -111,10 +119,10 @@ def test_the_rational_tanh_keeps_its_stated_error(tmp_path):
     times = np.concatenate([np.linspace(1e-6, 12.0, 200_001), 2.0 ** np.linspace(-60, 60, 50_001)])
     rows = np.zeros((2 * len(times), 13), np.float32)
     rows[:, 12] = np.concatenate([times, -times])
-    with check.CompiledPolicy(c_source(source, "rational"), source) as compiled:
-        values = compiled.force(rows)
+    with check.CompiledPolicy(c_file(source, "rational"), source) as compiled:
+        values = compiled.answer(rows)[:, 0]
         rows[:1, 12] = np.nan
-        assert np.isnan(compiled.force(rows[:1])[0])
+        assert np.isnan(compiled.answer(rows[:1])).all()
     wanted = np.tanh(np.concatenate([times, -times]).astype(np.float32).astype(float))
     assert np.max(np.abs(values / wanted - 1.0)) <= TANH_ERROR
 
@@ -123,13 +131,13 @@ def test_the_rational_tanh_keeps_its_stated_error(tmp_path):
 @pytest.mark.parametrize("name", CARTPOLE_NAMES)
 def test_onnx_equals_numpy(name, observations):
     source = load_source(name)
-    model = policy_model(source)
-    forces = check.onnx_force(model, observations)
+    model = onnx_file(source)
+    forces = check.onnx_answer(model, observations)
     found = check.agreement(forces, source, observations)
-    assert found.largest_force > 10.0
+    assert found.largest > 10.0
     assert found.relative < 1e-6
     # A batch of one is the same model.
-    assert check.onnx_force(model, observations[:1])[0] == pytest.approx(forces[0], rel=1e-5)
+    assert check.onnx_answer(model, observations[:1])[0] == pytest.approx(forces[0], rel=1e-5)
 
 
 # What u_L reads of an observation: the rest of the goal and of the start are not used.
@@ -138,7 +146,7 @@ READ = (0, 1, 2, 3, 4, 8, 9, 12)
 
 def spoiled(value):
     """One observation for each of its numbers, which has this value there."""
-    rows = np.repeat(example_observations(1, seed=3), 13, axis=0)
+    rows = np.repeat(examples(1, seed=3), 13, axis=0)
     np.fill_diagonal(rows, value)
     return rows
 
@@ -149,12 +157,12 @@ def exported(request):
     source = load_source("lagros-cartpole")
     if request.param == "onnx":
         pytest.importorskip("onnxruntime")
-        yield source, lambda rows: check.onnx_force(policy_model(source), rows)
+        yield source, lambda rows: check.onnx_answer(onnx_file(source), rows)
         return
     if check.compiler() is None:
         pytest.skip("no C compiler")
-    with check.CompiledPolicy(c_source(source), source) as compiled:
-        yield source, compiled.force
+    with check.CompiledPolicy(c_file(source), source) as compiled:
+        yield source, compiled.answer
 
 
 def test_nan_where_it_is_read_and_nowhere_else(exported):
@@ -167,7 +175,7 @@ def test_infinite_and_extreme_numbers_as_in_numpy(exported, value):
     source, force = exported
     rows = spoiled(value)
     with np.errstate(all="ignore"):
-        wanted = source.force(rows)
+        wanted = source.answer(rows)
     # Two infinities of opposite sign, of the goal in two features, may meet in the first layer.
     assert set(np.flatnonzero(np.isnan(wanted))) <= {4}
     np.testing.assert_allclose(force(rows), wanted, rtol=1e-5, atol=1e-5)
@@ -176,8 +184,8 @@ def test_infinite_and_extreme_numbers_as_in_numpy(exported, value):
 @pytest.mark.parametrize("scale", [3.0, 10.0, 100.0, 1e3, 1e4, 1e10, 1e30])
 def test_far_outside_of_what_was_trained_no_worse_than_numpy(exported, scale):
     source, force = exported
-    rows = (example_observations(500, seed=7) * np.float32(scale)).astype(np.float32)
-    exact, wanted = by_hand(source.network, rows), source.force(rows)
+    rows = (examples(500, seed=7) * np.float32(scale)).astype(np.float32)
+    exact, wanted = by_hand(source.policy.network, rows), source.answer(rows)
     largest = np.max(np.abs(exact))
     # Pre-activations of this size have no more digits than float32 leaves them.
     rounding = np.max(np.abs(wanted - exact)) / largest
@@ -187,12 +195,14 @@ def test_far_outside_of_what_was_trained_no_worse_than_numpy(exported, scale):
 
 def test_near_the_force_itself_where_it_exceeds_a_newton(exported):
     source, force = exported
-    rows = example_observations(5000)
-    wanted = source.force(rows)
+    rows = examples(5000)
+    wanted = source.answer(rows)
     large = np.abs(wanted) > 1.0
     assert np.mean(large) > 0.8
     np.testing.assert_allclose(force(rows)[large], wanted[large], rtol=5e-6)
-    np.testing.assert_allclose(wanted[large], by_hand(source.network, rows)[large], rtol=5e-6)
+    np.testing.assert_allclose(
+        wanted[large], by_hand(source.policy.network, rows)[large], rtol=5e-6
+    )
 
 
 @needs_onnx
@@ -200,7 +210,7 @@ def test_onnx_ports_and_provenance():
     import onnxruntime
 
     source = load_source("lagros-cartpole")
-    session = onnxruntime.InferenceSession(policy_model(source), providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(onnx_file(source), providers=["CPUExecutionProvider"])
     (port,), (answer,) = session.get_inputs(), session.get_outputs()
     assert (port.name, port.shape, port.type) == ("observation", ["batch", 13], "tensor(float)")
     assert (answer.name, answer.shape) == ("force", ["batch", 1])
@@ -226,10 +236,10 @@ def test_the_provenance_is_that_of_the_file():
     source = load_source("lagros-cartpole")
     data = (PRETRAINED / "cartpole_lagros.safetensors").read_bytes()
     assert source.digest == hashlib.sha256(data).hexdigest()
-    text = c_source(source)
+    text = c_file(source)
     assert source.digest in text
     assert "malloc" not in text
-    assert text == c_source(source)
+    assert text == c_file(source)
 
 
 def test_mistakes_are_explained(tmp_path):
@@ -238,22 +248,22 @@ def test_mistakes_are_explained(tmp_path):
     with pytest.raises(FileNotFoundError, match="there is no file"):
         load_source("lagros-cartpole", tmp_path / "none.safetensors")
     Mlp([np.ones((5, 1))], [np.ones(1)]).save(tmp_path / "five.safetensors")
-    with pytest.raises(ValueError, match="a cart-pole network has 7 and 1"):
+    with pytest.raises(ValueError, match="network has 7 and 1"):
         load_source("lagros-cartpole", tmp_path / "five.safetensors")
     with pytest.raises(ValueError, match="tanh='fast' must be one of rational, libm"):
-        c_source(load_source("lagros-cartpole"), "fast")
+        c_file(load_source("lagros-cartpole"), "fast")
 
 
 @needs_compiler
 def test_a_file_that_does_not_compile_is_refused():
     source = load_source("lagros-cartpole")
     with pytest.raises(RuntimeError, match="refuses the exported file"):
-        check.CompiledPolicy(c_source(source) + "int unused(", source)
+        check.CompiledPolicy(c_file(source) + "int unused(", source)
 
 
 def test_an_agreement_with_nan_is_none():
     source = load_source("lagros-cartpole")
-    rows = example_observations(3)
-    forces = source.force(rows).copy()
+    rows = examples(3)
+    forces = source.answer(rows).copy()
     forces[1] = np.nan
     assert not check.agreement(forces, source, rows).relative <= 1.0

@@ -9,13 +9,14 @@ import pytest
 
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.export import check, load_source
-from lagros_policies.export.file import c_file, onnx_file
-from lagros_policies.export.source import SPACECRAFT_NAMES
+from lagros_policies.export.c99 import c_file
+from lagros_policies.export.onnx import onnx_file
 from lagros_policies.learning.deep_set import DeepSet
 
 needs_compiler = pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
 needs_onnx = pytest.mark.skipif(not check.has_onnxruntime(), reason="no onnxruntime")
 
+SPACECRAFT_NAMES = ("lagros-spacecraft", "learned-spacecraft")
 WORLDS = [("paper", None), ("released", 2), ("open", 1)]
 CLOSE = {"rtol": 1e-5, "atol": 2e-6}
 
@@ -53,7 +54,7 @@ def turned(source, rows, angle):
     """The same scenes, the whole world turned counter-clockwise; headings count clockwise."""
     spin = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     found = rows.astype(np.float64)
-    at = source.layout.slices
+    at = source.policy.layout.slices
     pairs = [slice(0, 2), slice(2, 4)]
     begin = at["neighbours"].start
     pairs += [slice(i, i + 2) for i in range(begin, at["neighbours"].stop, 2)]
@@ -118,7 +119,7 @@ def test_c_equals_numpy(name, preset, agents):
 def test_c_equals_numpy_in_flight():
     source = load_source("lagros-spacecraft", num_agents=4)
     rows = in_flight(source, 4)
-    at = source.layout.slices
+    at = source.policy.layout.slices
     assert np.any(rows[:, at["neighbour_mask"]])
     assert np.any(rows[:, at["obstacle_mask"]])
     with check.CompiledPolicy(c_file(source), source) as compiled:
@@ -139,7 +140,7 @@ def test_c_does_not_care_how_the_world_is_turned():
 @needs_compiler
 def test_bodies_may_come_in_any_number_and_order(called):
     source, function = called
-    at, layout = source.layout.slices, source.layout
+    at, layout = source.policy.layout.slices, source.policy.layout
     rng = np.random.default_rng(3)
     rows = source.examples(40)
     for row, wanted in zip(rows, source.answer(rows), strict=True):
@@ -169,8 +170,8 @@ def test_c_at_the_goal_and_inside_another_body_is_finite(called):
     own[4] = 1.0
     neighbours, obstacles = np.zeros((1, 4)), np.array([[0.0, 0.0, 0.5]])
     forces = function.thrust(own, neighbours, obstacles)
-    row = np.zeros((1, source.inputs), np.float32)
-    at = source.layout.slices
+    row = np.zeros((1, source.program.inputs), np.float32)
+    at = source.policy.layout.slices
     row[0, :9] = own
     row[0, at["neighbour_mask"].start] = row[0, at["obstacle_mask"].start] = 1.0
     row[0, at["obstacles"].start + 2] = 0.5
@@ -193,7 +194,7 @@ def test_no_nan_is_lost_in_c(called):
 @pytest.mark.parametrize("kind", ["c", "onnx"])
 def test_no_nan_of_the_flat_observation_is_lost(kind):
     source = load_source("lagros-spacecraft", num_agents=3)
-    at = source.layout.slices
+    at = source.policy.layout.slices
     rows = source.examples(50, seed=4)
     seen = rows[:, [*range(*at["neighbour_mask"].indices(99)), at["obstacle_mask"].start]]
     row = rows[np.argmax(np.sum(seen, axis=1))]
@@ -222,7 +223,7 @@ def test_no_nan_of_the_flat_observation_is_lost(kind):
 def test_onnx_equals_numpy_far_outside_of_what_was_trained(part, scale):
     source = load_source("lagros-spacecraft", num_agents=3)
     rows = source.examples(300, seed=5)
-    rows[:, source.layout.slices[part]] *= np.float32(scale)
+    rows[:, source.policy.layout.slices[part]] *= np.float32(scale)
     found = check.agreement(check.onnx_answer(onnx_file(source), rows), source, rows)
     assert found.relative < 2e-6
 
@@ -246,7 +247,7 @@ def test_c_of_any_network(tmp_path, widths):
 def test_the_self_test_passes_and_can_fail(tmp_path):
     source = load_source("lagros-spacecraft")
     text = c_file(source)
-    spoiled = text.replace("inputs[7] = own[6];", "inputs[7] = own[6] + 0.01f;")
+    spoiled = text.replace("input[7] = own[6];", "input[7] = own[6] + 0.01f;")
     assert spoiled != text
     for case, status in ((text, 0), (spoiled, 1)):
         code, program = tmp_path / "policy.c", tmp_path / "policy"
@@ -277,7 +278,7 @@ def test_onnx_equals_numpy_in_flight_and_ignores_what_is_not_sensed():
     model = onnx_file(source)
     forces = check.onnx_answer(model, rows)
     np.testing.assert_allclose(forces, source.answer(rows), **CLOSE)
-    at, layout = source.layout.slices, source.layout
+    at, layout = source.policy.layout.slices, source.policy.layout
     spoiled = rows.copy()
     for kind, width in (("neighbour", 4), ("obstacle", 3)):
         absent = np.repeat(rows[:, at[f"{kind}_mask"]] == 0.0, width, axis=1)
@@ -310,5 +311,4 @@ def test_the_c_file_is_the_same_again_and_has_the_presets_radii():
     assert text == c_file(source)
     assert source.digest in text
     assert "malloc" not in text
-    assert "#define TOUCH 0x1p+0f /* 1:" in text
-    assert "#define CORE 0x0p+0f /* 0:" in text
+    assert "0.5 m against others, 0 m against obstacles" in " ".join(text.split())

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from lagros_policies.export.source import Source
 
 FORMATS = ("c", "onnx")
-# Largest difference from NumPy, in units of the largest force, with which a file is written: room
+# Largest difference from NumPy, in units of the largest control, with which a file is written: room
 # for float32 summed in another order, and for no mistake.
 TOLERANCE = 1e-5
 
@@ -27,48 +27,49 @@ TOLERANCE = 1e-5
 def export(
     policy: Annotated[
         str,
-        typer.Argument(
-            help="lagros-cartpole, learned-cartpole, lagros-spacecraft or learned-spacecraft."
-        ),
+        typer.Argument(help="POLICY-TASK, as in lagros-cartpole; or lagros or learned, and TASK."),
     ],
+    task: Annotated[
+        str | None,
+        typer.Argument(help="A name, module:attribute or ./file.py, if not in POLICY."),
+    ] = None,
     format_: Annotated[
         str,
         typer.Option("--format", metavar="FORMAT", help="c (one C99 file) or onnx."),
     ] = "c",
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", dir_okay=False, help="Where to; lagros_cartpole.c or .onnx, and so on."
-        ),
+        typer.Option(metavar="FILE", dir_okay=False, help="Where to; POLICY_TASK.c or .onnx."),
     ] = None,
     weights: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", dir_okay=False, help="Weights of your own; the shipped ones if not."
+            metavar="FILE", dir_okay=False, help="Weights of your own; those of the task if not."
         ),
     ] = None,
     tanh: Annotated[
         str | None,
         typer.Option(
             metavar="KIND",
-            help="In C, of the cart-pole: rational (a quotient of polynomials, 4e-7 off) or libm "
-            "(much slower); rational if not given.",
+            help="In C, of a network with tanh: rational (a quotient of polynomials, 4e-7 off) or "
+            "libm (much slower); rational if not given.",
         ),
     ] = None,
     preset: Annotated[
         str | None,
-        typer.Option(help="Of the spacecraft: the radii of its bodies; paper if not given."),
+        typer.Option(help="Of many agents: the radii of their bodies; paper if not given."),
     ] = None,
     agents: Annotated[
         int | None,
-        typer.Option(help="Of the spacecraft: slots of the observation in ONNX; as the preset."),
+        typer.Option(help="Of many agents: slots of the observation in ONNX; as the preset."),
     ] = None,
 ) -> None:
-    """Write a policy's network as one C file or ONNX model: observation in, newtons out."""
+    """Write a policy's network as one C file or ONNX model: observation in, controls out."""
     from lagros_envs.checks import shown
     from lagros_envs.files import write_atomic
+    from lagros_envs.task import Task
     from lagros_policies.export.c99 import TANHS
-    from lagros_policies.export.source import CARTPOLE_NAMES, SPACECRAFT_NAMES, load_source
+    from lagros_policies.export.source import load_source, parted
 
     if format_ not in FORMATS:
         fail(f"--format: {shown(format_)} must be one of {', '.join(FORMATS)}")
@@ -76,27 +77,31 @@ def export(
         fail(f"--tanh: {shown(tanh)} must be one of {', '.join(TANHS)}")
     if format_ == "onnx" and tanh is not None:
         fail("--tanh is for --format c; leave it out for onnx")
-    if policy in CARTPOLE_NAMES and (preset is not None or agents is not None):
-        fail("--preset and --agents are for the spacecraft; leave them out for the cart-pole")
-    if policy in SPACECRAFT_NAMES and tanh is not None:
-        fail("--tanh is for the cart-pole; the spacecraft's network has no tanh: leave it out")
-    path = out or Path(f"{policy.replace('-', '_')}.{format_}")
+    told = {"preset": preset, "num_agents": agents}
+    given = {name: value for name, value in told.items() if value is not None}
     try:
-        source = load_source(policy, weights, preset or "paper", agents)
+        full = policy if task is None else f"{policy}-{task}"
+        found = parted(full)[1]
+        if given and isinstance(found, Task):
+            fail(f"{found.name} is one body: --preset and --agents do not fit; leave them out")
+        source = load_source(full, weights, **given)
+        path = out or Path(f"{source.identifier}.{format_}")
         check_outputs({"--out": path}, {"--weights": weights})
     except (ValueError, OSError) as error:
         fail(error)
+    if tanh is not None and not source.program.tanh:
+        fail(f"the network of {source.name} has no tanh: leave --tanh out")
     try:
-        data, found, cost = _written(source, format_, cast("Tanh", tanh or TANHS[0]))
-    except RuntimeError as error:
+        data, compared, cost = _written(source, format_, cast("Tanh", tanh or TANHS[0]))
+    except (RuntimeError, ImportError) as error:
         fail(error, status=1)
-    if isinstance(found, str):
-        line = f"not compared with NumPy: {found}"
-    elif found.relative <= TOLERANCE:
-        line = f"differs from NumPy, over 1000 observations, by at most {found}"
+    if isinstance(compared, str):
+        line = f"not compared with NumPy: {compared}"
+    elif compared.relative <= TOLERANCE:
+        line = f"differs from NumPy, over 1000 observations, by at most {compared}"
     else:
         # A NaN lands here too.
-        fail(f"not written: the export and NumPy differ by {found}", status=1)
+        fail(f"not written: the export and NumPy differ by {compared}", status=1)
     delivery = Delivery()
     delivery.write(
         path,
@@ -114,8 +119,9 @@ def _written(
 ) -> tuple[str | bytes, Agreement | str, list[str]]:
     """Return the file's content, how it compares with NumPy, or why not, and what it costs."""
     from lagros_policies.export import check
+    from lagros_policies.export.c99 import c_file
     from lagros_policies.export.cost import PLAIN, c_time, onnx_time
-    from lagros_policies.export.file import c_file, onnx_file
+    from lagros_policies.export.onnx import INSTALL, onnx_file
 
     if format_ == "c":
         text = c_file(source, tanh)
@@ -126,7 +132,7 @@ def _written(
         return text, found, [_time(*c_time(text, source), where), *_bytes(text)]
     model = onnx_file(source)
     if not check.has_onnxruntime():
-        return model, f"ONNX Runtime is not installed ({check.INSTALL})", []
+        return model, f"ONNX Runtime is not installed ({INSTALL})", []
     found = check.check_onnx(model, source)
     return model, found, [_time(*onnx_time(model, source), "here, ONNX Runtime, one thread")]
 

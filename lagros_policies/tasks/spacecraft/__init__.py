@@ -15,6 +15,8 @@ POLICIES = {
 }
 SPACECRAFT_NAMES = tuple(POLICIES)  # the older name of `policy_names`
 SPACES = "lagros_policies.tasks.spacecraft.setup:spaces"
+# What takes one of them apart for `lagros export`.
+EXPORT = "lagros_policies.tasks.spacecraft.export:exported"
 
 
 def told(world: Any, given: Mapping[str, Any]) -> dict[str, Any]:
