@@ -109,8 +109,8 @@ def export(
         (lambda: data) if isinstance(data, str) else None,
     )
     typer.echo(f"weights {source.file}, SHA-256 {source.digest}")
-    for told in (line, *cost):
-        typer.echo(told)
+    for text in (line, *cost):
+        typer.echo(text)
     delivery.tell(f"{len(data) / 1e3:.0f} kB")
 
 
