@@ -270,7 +270,9 @@ def _written(command: tuple[str, ...]) -> Any:
             return {"exit status": run.returncode, "said": run.stderr[-1000:]}
         text = out.read_text(encoding="utf-8")
         if command[0] == "export":
-            return text.splitlines()
+            # Layers in any order; what is around them the command itself compares with NumPy.
+            layers = r"static const float (?!last)\w*(?:weight|bias)\w*\[\d+\] = \{(.*?)\};"
+            return sorted(" ".join(found.split()) for found in re.findall(layers, text, re.DOTALL))
         if command[-1] == "--episodes-file":
             return [json.loads(line) for line in text.splitlines()]
         return json.loads(text)

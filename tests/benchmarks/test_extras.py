@@ -146,7 +146,7 @@ def test_the_extra_of_the_command_line_flies_draws_and_certifies(project, tmp_pa
         "attack cartpole --episodes 1 --budget 60 --npz f.npz",
         "certify spacecraft --episodes 0",
         "export learned-cartpole --out g.c",
-        "export lagros-cartpole --format onnx --out h.onnx",
+        "export lagros-cartpole --out h.c",
     ]
     found = outcomes(project, commands, tmp_path)
     assert len(found) == len(commands)

@@ -17,7 +17,7 @@ MODULES = {
     "render": ("pygame",),
     "video": ("imageio_ffmpeg",),
     "data": ("PIL", "minari", "pyarrow"),
-    "onnx": ("onnxruntime",),
+    "onnx": ("onnx", "onnxruntime"),
     "attack": ("cmaes",),
     "ray": ("ray",),
     "dask": ("distributed", "joblib"),
