@@ -112,14 +112,14 @@ def bare_environment(env: Any, allow_wrappers: bool = False) -> Any:
 
 
 def _made(name: Any) -> Any:
-    import lagros_envs  # noqa: F401  (registers the environments)
+    from lagros_envs.registry import task_named, task_names
 
     try:
         return gym.make(name)
     except (gym.error.Error, ImportError) as error:
+        known = " or ".join(repr(task_named(one).env_id) for one in task_names())
         raise ValueError(
-            f"env={name!r} cannot be made ({error}); name 'lagros/CartPole-v0' or "
-            "'lagros/Spacecraft-v0', or give an environment"
+            f"env={name!r} cannot be made ({error}); name {known}, or give an environment"
         ) from error
 
 

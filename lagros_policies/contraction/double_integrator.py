@@ -1,8 +1,9 @@
-"""The certificate of the spacecraft: one constant metric per axis, exact for all states.
+"""The certificate of double integrators: one constant metric per axis, exact for all states.
 
-B B' = diag(0, 0, 0, 4, 4, 2) at every heading, so that each axis (x, y, heading) is a double
-integrator de = A e + g a in its error e = (position, velocity), whatever the state. Theorem 2 asks
-for a constant W = [[1, q], [q, s]] (up to scale) with, for some nu,
+Where B B' is the same diagonal at every state and reaches all velocities, as of a body that floats
+with thrusters on all sides, each axis is a double integrator de = A e + g a in its error e =
+(position, velocity), whatever the state. Theorem 2 asks for a constant W = [[1, q], [q, s]] (up to
+scale) with, for some nu,
 
     A W + W A' - 2 nu g g' <= -2 alpha W     <=>  q <= -alpha                    (control at will)
     F W F' - nu g g' <= exp(-2 alpha h) W    <=>  q <= -(1 + h^2 s / 4) tanh(alpha h) / h    (held)
@@ -34,7 +35,7 @@ FloatArray = NDArray[np.float64]
 _PANELS = 2000
 # Above the rounding of a bound, and the share of the rate that its proof gives up, relative.
 _ROUNDING = 1e-8
-# Fitted to simulations that tests/policies/test_spacecraft_metric.py repeats: 95 % of agents stay
+# Fitted to simulations that tests/policies/test_double_integrator.py repeats: 95 % of agents stay
 # within this position error for 30 s of uniform-in-ball disturbance of bound 1, redrawn every
 # 0.1 s, at alpha = 1 with the metric of least chi; and the power of 1/alpha.
 _EXPECTED_ERROR = 0.378

@@ -167,7 +167,7 @@ def _variation(
 
 @dataclass(frozen=True, slots=True)
 class HeldMeanSquare:
-    """Bounds at the control instants 0 ... N of a spacecraft under u* (proved; see below).
+    """Bounds at the control instants 0 ... N of double integrators under u* (proved; see below).
 
     Attributes:
         energy: Of E V, shape (N + 1,).
