@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lagros_benchmarks.report.records import summarise
     from lagros_benchmarks.run.episodes import EpisodeRecord, run_episode
-    from lagros_benchmarks.run.library import Policy
     from lagros_benchmarks.run.runner import BenchmarkRun, kept_in, run_benchmark
     from lagros_benchmarks.run.settings import BenchmarkSettings
+    from lagros_policies.policy import Policy
 
 __all__ = [
     "BenchmarkRun",
@@ -28,14 +28,14 @@ __all__ = [
 ]
 
 _HOMES = {
-    "BenchmarkRun": "run.runner",
-    "BenchmarkSettings": "run.settings",
-    "EpisodeRecord": "run.episodes",
-    "Policy": "run.library",
-    "kept_in": "run.runner",
-    "run_benchmark": "run.runner",
-    "run_episode": "run.episodes",
-    "summarise": "report.records",
+    "BenchmarkRun": "lagros_benchmarks.run.experiment",
+    "BenchmarkSettings": "lagros_benchmarks.run.settings",
+    "EpisodeRecord": "lagros_benchmarks.run.episodes",
+    "Policy": "lagros_policies.policy",
+    "kept_in": "lagros_benchmarks.run.runner",
+    "run_benchmark": "lagros_benchmarks.run.runner",
+    "run_episode": "lagros_benchmarks.run.episodes",
+    "summarise": "lagros_benchmarks.report.records",
 }
 
 
@@ -45,7 +45,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(import_module(_HOMES[name]), name)
 
 
 class _OldNames:

@@ -91,7 +91,7 @@ class StraightPlanner:
 
     refuses: bool = True
 
-    def plan(self, initial_state, goal):
+    def plan(self, initial_state, goal, discs=None):
         if self.refuses and goal[0] > 4.5:
             raise RuntimeError("infeasible")
         share = np.linspace(0.0, 1.0, STEPS + 1)[:, None]
@@ -130,13 +130,17 @@ def make_policy(name, env, settings):
     return MAKERS[name](**settings) if settings else MAKERS[name]()
 
 
-def load_metric(path):
+def load_metric(task, path):
     return lambda states: np.broadcast_to(np.diag([1.0, 4.0, 1.0, 2.0]), (*states.shape, 4))
 
 
-def easy_planner():
+def planner(task):
+    return StraightPlanner()
+
+
+def easy_planner(task):
     return StraightPlanner(refuses=False)
 
 
-TOOLBOX = Toolbox(make_policy, StraightPlanner, load_metric)
+TOOLBOX = Toolbox(make_policy, planner, load_metric)
 EASY = Toolbox(make_policy, easy_planner, load_metric)

@@ -11,6 +11,7 @@ import numpy as np
 
 from lagros_benchmarks.run.library import Toolbox
 from lagros_envs.tasks.spacecraft.physics import Spacecraft
+from lagros_policies.policy import BasePolicy, as_policy
 from lagros_policies.tasks.spacecraft.thrusters import thrust_for_acceleration
 
 # Gains towards the goal, critically damped [1/s^2, 1/s].
@@ -132,7 +133,7 @@ class JointPolicy:
 
 
 @dataclass
-class HalfFilter:
+class HalfFilter(BasePolicy):
     """A filter in name: halves every thrust and counts the agents it did that to."""
 
     policy: Any
@@ -148,9 +149,11 @@ class HalfFilter:
         return 0.5 * action, (inner, count + len(np.reshape(action, (-1, 8))))
 
     def reseed(self, generator):
-        inner = getattr(self.policy, "reseed", None)
-        if inner is not None:
-            inner(generator)
+        as_policy(self.policy).reseed(generator)
+
+    @property
+    def draws(self):
+        return as_policy(self.policy).draws
 
     def counters(self, state):
         return {"interventions": state[1]}
@@ -178,7 +181,7 @@ def make_filter(policy, env, disturbance_bound):
 
 
 def position_margin(policy, disturbance_bound):
-    return disturbance_bound if isinstance(policy, JointPolicy) else None
+    return disturbance_bound if policy.name == "joint" else None
 
 
 TOOLBOX = Toolbox(make_policy=make_policy, make_filter=make_filter, position_margin=position_margin)

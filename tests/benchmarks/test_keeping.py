@@ -22,7 +22,7 @@ from lagros_benchmarks.run.keeping import Kept, decode, encode
 from lagros_benchmarks.run.library import Toolbox
 from lagros_benchmarks.run.runner import kept_in, run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings
-from lagros_benchmarks.tasks.cartpole.experiment import CartPoleExperiment
+from lagros_benchmarks.run.single import SingleExperiment
 from lagros_benchmarks.tasks.spacecraft.episodes import AgentRecord, Flight
 from tests.benchmarks import fakes, killed_runs
 
@@ -299,7 +299,7 @@ def bench(tmp_path, monkeypatch):
 @pytest.fixture
 def interrupted(monkeypatch):
     """Ctrl-C in the second chunk of episodes."""
-    play = CartPoleExperiment.play
+    play = SingleExperiment.play
 
     def stop(self, case, units):
         if case.policy == "idle":
@@ -307,7 +307,7 @@ def interrupted(monkeypatch):
         return play(self, case, units)
 
     with monkeypatch.context() as patch:
-        patch.setattr(CartPoleExperiment, "play", stop)
+        patch.setattr(SingleExperiment, "play", stop)
         yield patch
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from lagros_benchmarks.report import canvas, figures, formats, tables
+from lagros_benchmarks.report import canvas, figures, formats, single_figures, tables
 from lagros_benchmarks.report.records import summarise
 from lagros_benchmarks.run import files
 from lagros_benchmarks.run.runner import run_benchmark
@@ -194,7 +194,7 @@ def test_the_error_figure_is_drawn(rows, tmp_path):
 def test_the_error_figure_takes_what_json_made_of_the_rows(rows, tmp_path):
     far = {**rows[0], "mean_tracking_error": [0.0, *np.geomspace(0.1, 500.0, 88), np.inf, np.inf]}
     again = json.loads(json.dumps(files.plain([far, *rows[1:]])))
-    assert figures.error_figure(again, tmp_path / "log.png").stat().st_size > 10_000
+    assert single_figures.error_figure(again, tmp_path / "log.png").stat().st_size > 10_000
 
 
 def test_the_success_figure_is_drawn(grid_rows, tmp_path):
@@ -206,10 +206,10 @@ def test_the_success_figure_is_drawn(grid_rows, tmp_path):
 @pytest.mark.parametrize("count", range(1, 9))
 def test_one_place_of_the_success_figure_stays_empty_at_most(grid_rows, monkeypatch, count):
     drawn = []
-    monkeypatch.setattr(figures, "save", lambda figure, _: drawn.append(figure))
+    monkeypatch.setattr(single_figures, "save", lambda figure, _: drawn.append(figure))
     kinds = [f"kind {number}" for number in range(count)]
     rows = [{**row, "disturbance": kind} for row in grid_rows[:4] for kind in kinds]
-    figures.grid_figure(rows, "grid.png")
+    single_figures.grid_figure(rows, "grid.png")
     (figure,) = drawn
     shown = [axes for axes in figure.axes if axes.axison]
     assert [axes.get_title("left") for axes in shown] == kinds
@@ -222,25 +222,27 @@ def test_one_place_of_the_success_figure_stays_empty_at_most(grid_rows, monkeypa
 
 @pytest.mark.parametrize("suffix", ["pdf", "svg"])
 def test_figures_for_print(rows, tmp_path, suffix):
-    path = figures.error_figure(rows, tmp_path / f"error.{suffix}")
+    path = single_figures.error_figure(rows, tmp_path / f"error.{suffix}")
     assert path.stat().st_size > 5_000
 
 
 def test_a_figure_says_what_it_cannot_draw(rows, grid_rows, tmp_path):
     with pytest.raises(ValueError, match="must end in"):
-        figures.error_figure(rows, tmp_path / "error.gif")
+        single_figures.error_figure(rows, tmp_path / "error.gif")
     with pytest.raises(ValueError, match="one condition"):
-        figures.error_figure(grid_rows, tmp_path / "error.png")
+        single_figures.error_figure(grid_rows, tmp_path / "error.png")
     with pytest.raises(ValueError, match="every nominal plan failed"):
-        figures.error_figure([{**rows[0], "mean_tracking_error": None}], tmp_path / "error.png")
+        single_figures.error_figure(
+            [{**rows[0], "mean_tracking_error": None}], tmp_path / "error.png"
+        )
 
 
 def test_known_policies_always_look_the_same_and_all_differ():
     known = dict.fromkeys((*NAMES, *SPACECRAFT_NAMES))
     names = ["x.zip", *known, "y.zip", "mine:A", "mine:B", "mine:C"]
-    found = figures.styles(names)
+    found = canvas.styles(names)
     for name in known:
-        assert figures.styles(["z.zip", name])[name] == found[name]
+        assert canvas.styles(["z.zip", name])[name] == found[name]
     for part in ("colour", "line", "marker"):
         # Only (d) and LQR, which no task has both of, share a mark.
         same = len(names) - len({str(getattr(style, part)) for style in found.values()})

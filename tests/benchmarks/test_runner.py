@@ -10,7 +10,7 @@ import pytest
 from lagros_benchmarks.run.library import SetupError
 from lagros_benchmarks.run.runner import Case, run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings, Condition
-from lagros_benchmarks.tasks.cartpole.experiment import plan_nominals
+from lagros_benchmarks.run.single import SingleExperiment
 from tests.benchmarks import fakes
 
 UNIFORM = Condition("uniform", 0.75)
@@ -75,11 +75,11 @@ def test_plans_are_made_once_per_scenario_and_failed_ones_say_why():
     calls = []
 
     class Counting(fakes.StraightPlanner):
-        def plan(self, initial_state, goal):
+        def plan(self, initial_state, goal, discs=None):
             calls.append(goal[0])
             return super().plan(initial_state, goal)
 
-    toolbox = dataclasses.replace(fakes.TOOLBOX, make_planner=Counting)
+    toolbox = dataclasses.replace(fakes.TOOLBOX, make_planner=lambda task: Counting())
     settings = settings_of("steady", "idle", bounds=(0.1, 0.2), episodes=40)
     run = run_benchmark(settings, toolbox)
     assert len(calls) == 40
@@ -141,7 +141,9 @@ def test_settings_of_a_policy_reach_it():
 
 def test_progress_is_told_of_every_chunk():
     told = []
-    plan_nominals(settings_of("steady"), fakes.EASY, lambda *args: told.append(args))
+    SingleExperiment.set_up(settings_of("steady"), fakes.EASY).units(
+        lambda *args: told.append(args)
+    )
     assert told == [("planning", 1, 3), ("planning", 2, 3), ("planning", 3, 3)]
 
 

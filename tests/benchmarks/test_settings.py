@@ -6,6 +6,7 @@ import pytest
 
 import lagros_policies
 from lagros_benchmarks.run.settings import BenchmarkSettings, check_policy
+from lagros_envs.registry import task_named, task_names
 from lagros_envs.seeding import EVALUATION, episode_seeds
 from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 
@@ -48,12 +49,16 @@ def test_a_wrong_setting_of_the_spacecraft_is_refused(changes, message):
         BenchmarkSettings.for_task("spacecraft", **changes)
 
 
+SINGLE = [name for name in task_names() if task_named(name).most_agents == 1]
+
+
 @pytest.mark.parametrize(
     "changes", [{"preset": "paper"}, {"agents": (6,)}, {"safety_filter": "both"}]
 )
-def test_the_cart_pole_has_no_settings_of_the_spacecraft(changes):
-    with pytest.raises(ValueError, match="for the task spacecraft; leave it out"):
-        BenchmarkSettings.for_task("cartpole", **changes)
+@pytest.mark.parametrize("task", SINGLE)
+def test_one_body_has_no_settings_of_many_agents(task, changes):
+    with pytest.raises(ValueError, match=f"does not fit: {task} is one body; leave it out"):
+        BenchmarkSettings.for_task(task, **changes)
 
 
 def test_each_task_has_its_own_defaults():

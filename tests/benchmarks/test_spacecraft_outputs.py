@@ -297,7 +297,7 @@ def invoke(tmp_path, monkeypatch):
         (("--safety-filter", "yes"), "Valid: none, all, both"),
         (("--policies", "lqr"), "Valid: learned, tube-mpc, lagros, centralized"),
         (("--disturbance", "worst"), "'worst' pushes away"),
-        (("--replan-every", "2"), "--replan-every is for cartpole"),
+        (("--replan-every", "2"), "--replan-every is for one body"),
         (("--scene", "s.gif"), "must end in .png"),
         (("--scene", "s.png", "--episodes", "2", "--scene-world", "2"), "scene_world=2"),
     ],
@@ -312,8 +312,8 @@ def test_a_mistake_is_explained(invoke, arguments, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("bench", "cartpole", "--scene", "s.png"), "cartpole has none"),
-        (("bench", "cartpole", "--agents", "6"), "is for the task spacecraft"),
+        (("bench", "cartpole", "--scene", "s.png"), "cartpole has no worlds of agents"),
+        (("bench", "cartpole", "--agents", "6"), "does not fit: cartpole is one body"),
     ],
 )
 def test_what_is_for_spacecraft_only_says_so(invoke, arguments, message):

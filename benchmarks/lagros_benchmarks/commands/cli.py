@@ -40,13 +40,11 @@ if TYPE_CHECKING:
     from lagros_benchmarks.report.delivery import Outputs
     from lagros_benchmarks.report.records import Row
     from lagros_benchmarks.run.keeping import Kept
-    from lagros_benchmarks.run.reproduction import Reproduction
     from lagros_benchmarks.run.settings import BenchmarkSettings
-    from lagros_policies.backends import Backend
 
 BENCH_FOLDER, DEMO_FOLDER = Path("runs/bench"), Path("runs/demo")
-# The paper's experiment: the default policies, 50 episodes, uniform disturbance.
-DEMO: dict[str, Any] = {"episodes": 50, "disturbances": ("uniform",), "bounds": (0.75,)}
+# What the demonstration changes of the defaults, which are the paper's experiment: nothing.
+DEMO: dict[str, Any] = {}
 
 app = typer.Typer(
     cls=Commands,
@@ -57,11 +55,16 @@ app = typer.Typer(
 )
 
 
+TASK = typer.Argument(help="{tasks}; or one of your own: module:attribute, or a .py file.")
+
+
 def _file(explanation: str) -> Any:
     return typer.Option(metavar="FILE", dir_okay=False, help=explanation)
 
 
-BACKEND_OPTION = typer.Option(help="Whose processes the workers are: of loky, ray or dask.")
+BACKEND_OPTION = typer.Option(
+    help="Where the workers run: loky (this machine), or a cluster of ray or dask."
+)
 ADDRESS_OPTION = typer.Option(
     help="Of a running cluster of ray or dask, which is used with the workers that it has."
 )
@@ -81,47 +84,44 @@ def main(
 
 @app.command(cls=Command)
 def bench(
-    task: Annotated[str, typer.Argument(help="cartpole, or spacecraft.")],
+    task: Annotated[str, TASK],
     policies: Annotated[
         str | None,
         typer.Option(
             metavar="NAME[,NAME]",
-            help="cartpole: of learned, tube-mpc, lagros, lqr, random, ppo, sac, td3, residual. "
-            "spacecraft: of learned, tube-mpc, lagros, centralized, ppo. Or a "
-            "stable-baselines3 .zip, or module:Class.",
+            help="{policies} Or a stable-baselines3 .zip, or module:Class.",
         ),
     ] = None,
     episodes: Annotated[
-        int | None, typer.Option(help="Episodes (worlds) of each policy and condition; 50.")
+        int | None, typer.Option(help="Episodes (worlds) of each policy and condition; {episodes}.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed; its episodes never occur in training.")] = 0,
     disturbance: Annotated[
         str,
         typer.Option(
             metavar="KIND[,KIND]",
-            help="Of none, uniform, sphere, constant, sinusoid, gust, worst.",
+            help="Of {disturbances}.",
         ),
     ] = "uniform",
     bound: Annotated[
         str | None,
         typer.Option(
             metavar="D[,D]",
-            help="Bounds d̄ of the disturbance, in units of the state per second. cartpole: 0.75; "
-            "spacecraft: 0.2,0.4,0.6,0.8,1.0.",
+            help="Bounds d̄ of the disturbance, in units of the state per second; {bounds}.",
         ),
     ] = None,
     channels: Annotated[str, typer.Option(help="Disturbed states: all, or rates.")] = "all",
     agents: Annotated[
         str | None,
-        typer.Option(metavar="N[,N]", help="Spacecraft in a world, 6; several compare them."),
+        typer.Option(metavar="N[,N]", help="Agents in a world, {agents}; several compare them."),
     ] = None,
     preset: Annotated[
         str | None,
-        typer.Option(help="Spacecraft: paper, released, crossing, open or swarm."),
+        typer.Option(help="Kind of worlds of agents: {presets}."),
     ] = None,
     safety_filter: Annotated[
         str | None,
-        typer.Option(help="Spacecraft: none, all (policies wear it) or both; both."),
+        typer.Option(help="Of agents: none, all (policies use it) or both; {safety_filter}."),
     ] = None,
     jobs: Annotated[
         int, typer.Option(help="Worker processes; Δt is then measured in a serial pass after.")
@@ -129,10 +129,10 @@ def bench(
     backend: Annotated[str, BACKEND_OPTION] = "loky",
     address: Annotated[str | None, ADDRESS_OPTION] = None,
     timing_episodes: Annotated[
-        int, typer.Option(help="Episodes of that pass, which spacecraft always have.")
+        int, typer.Option(help="Episodes of that pass, which worlds of agents always have.")
     ] = 10,
     replan_every: Annotated[
-        int | None, typer.Option(help="cartpole: control steps between the plans of tube-mpc, 1.")
+        int | None, typer.Option(help="One body: control steps between the plans of tube-mpc, 1.")
     ] = None,
     json: Annotated[Path | None, _file("All figures, one object per policy and condition.")] = None,
     csv: Annotated[Path | None, _file("The scalar figures.")] = None,
@@ -141,12 +141,12 @@ def bench(
     figure: Annotated[
         Path | None,
         _file(
-            "cartpole: error over time, or success against the bound. spacecraft: success and "
-            "effort, against the bound; against the number of agents success and time."
+            "One body: error over time, or success against the bound. Agents: success and effort "
+            "against the bound; against their number success and time."
         ),
     ] = None,
     scene: Annotated[
-        Path | None, _file("Spacecraft: trajectories of every policy in one world.")
+        Path | None, _file("Agents: trajectories of every policy in one world.")
     ] = None,
     scene_world: Annotated[int, typer.Option(help="Which of the run's worlds, from 0.")] = 0,
     episodes_file: Annotated[
@@ -168,22 +168,17 @@ def bench(
     episodes a policy raised; they count as failures, and their rows are marked.
     """
     from lagros_benchmarks.report.delivery import Outputs
-    from lagros_benchmarks.run.settings import (
-        DEFAULT_POLICIES,
-        BenchmarkSettings,
-        check_policy,
-        check_task,
-    )
+    from lagros_benchmarks.run.settings import BenchmarkSettings, check_policy
     from lagros_envs.checks import check_whole
-    from lagros_envs.tasks.cartpole.task import CartPoleSettings
+    from lagros_envs.registry import find_task
     from lagros_policies.backends import Backend
     from lagros_policies.naming import listed_names
 
     outputs = Outputs(json, csv, latex, markdown, figure, episodes_file, scene, scene_world)
     named = None if policies is None else listed_names(policies)
-    find_users_modules(named or ())
+    find_users_modules((task, *(named or ())))
     try:
-        check_task(task)
+        described: Any = find_task(task)
         if named is not None and "" in named:
             raise ValueError("--policies: an entry is empty; write them as a,b")
         if scene is None:
@@ -191,11 +186,11 @@ def bench(
         if disturbance.strip() == "none":
             refuse_options(["--bound"], "no disturbance has a bound")
         if replan_every is not None:
-            if task != "cartpole":
-                raise ValueError(f"--replan-every is for cartpole; leave it out for {task}")
-            if "tube-mpc" not in (named or DEFAULT_POLICIES):
+            if described.most_agents > 1:
+                raise ValueError(f"--replan-every is for one body; leave it out for {task}")
+            if "tube-mpc" not in (named or described.defaults.policies):
                 raise ValueError("--replan-every is for tube-mpc, which is none of --policies")
-            check_whole("replan_every", replan_every, 1, CartPoleSettings().steps)
+            check_whole("replan_every", replan_every, 1, described.steps)
         settings = BenchmarkSettings.for_task(
             task,
             policies=listed_or_none(named, str, "--policies"),
@@ -217,7 +212,7 @@ def bench(
         for name in settings.policies:
             check_policy(name, task)
         files = policy_files(settings.policies)
-        outputs.check(task, settings.episodes, files, {"--out": out}, BENCH_FOLDER)
+        outputs.check(described, settings.episodes, files, {"--out": out}, BENCH_FOLDER)
     except ValueError as error:
         fail(error)
     run_and_report(settings, outputs, out or BENCH_FOLDER, keep=out is not None)
@@ -225,7 +220,7 @@ def bench(
 
 @app.command(cls=Command)
 def demo() -> None:
-    """The paper's cart-pole experiment: 50 paired episodes, the table and the figure."""
+    """The paper's first experiment: 50 paired episodes, the table and the figure."""
     from lagros_benchmarks.report.delivery import Outputs
     from lagros_benchmarks.run.settings import BenchmarkSettings
 
@@ -239,7 +234,7 @@ def demo() -> None:
 
 @app.command(cls=Command)
 def reproduce(
-    task: Annotated[str, typer.Argument(help="cartpole or spacecraft.")],
+    task: Annotated[str, TASK],
     folder: Annotated[
         Path | None,
         typer.Option(
@@ -253,27 +248,37 @@ def reproduce(
     address: Annotated[str | None, ADDRESS_OPTION] = None,
     episodes: Annotated[
         int | None,
-        typer.Option(help="Episodes (worlds) of each policy in the table; 50, spacecraft 20."),
+        typer.Option(help="Episodes (worlds) of each policy in the table."),
     ] = None,
     shipped: Annotated[
         bool, typer.Option("--shipped-weights", help="Only the benchmark, with what is shipped.")
     ] = False,
 ) -> None:
     """From nothing to the table and figures: metric or expert, data, training, benchmark."""
+    from lagros_benchmarks.report.delivery import Outputs
     from lagros_benchmarks.run.reproduction import reproduce as run_reproduction
-    from lagros_benchmarks.run.settings import check_task
+    from lagros_benchmarks.run.room import room_of
+    from lagros_envs.registry import find_task
     from lagros_policies.backends import Backend, BackendError, running
 
-    place = folder or Path(f"runs/reproduce-{task}")
+    find_users_modules((task,))
+    place = folder or Path("runs/reproduce")
     try:
-        check_task(task)
+        described = find_task(task)
+        place = folder or Path(f"runs/reproduce-{described.name}")
+        room = room_of(described)
         if not shipped:
             check_extra("lagros reproduce", "train")
         workers = Backend(backend, address)
-        wanted = _reproduction(task, episodes, jobs, workers)
-        outputs = _reproduced(task, place)
+        wanted = room.part("reproduce").for_task(task, episodes, jobs=jobs, backend=workers)
+        outputs = Outputs(
+            json=place / "results.json",
+            latex=place / "table.tex",
+            figure=place / room.reproduced,
+            scene=None if room.scene is None else place / "scene.png",
+        )
         check_outputs({}, folders={"--out": place})
-        outputs.check(task)
+        outputs.check(described)
         with progress_bar() as progress, running(workers, jobs):
             benchmark = (
                 wanted.benchmark(None)
@@ -287,29 +292,6 @@ def reproduce(
     except KeyboardInterrupt:
         interrupted(f"; the same command goes on with what is in {place}")
     run_and_report(benchmark, outputs, place / "benchmark", keep=True)
-
-
-def _reproduction(task: str, episodes: int | None, jobs: int, backend: Backend) -> Reproduction:
-    """Return what a task's run makes."""
-    asked: dict[str, Any] = {"jobs": jobs, "backend": backend}
-    if task == "cartpole":
-        from lagros_benchmarks.tasks.cartpole.reproduce import ReproduceSettings
-
-        return ReproduceSettings(**asked | ({} if episodes is None else {"episodes": episodes}))
-    from lagros_benchmarks.tasks.spacecraft.reproduce import SpacecraftReproduceSettings
-
-    return SpacecraftReproduceSettings(**asked | ({} if episodes is None else {"worlds": episodes}))
-
-
-def _reproduced(task: str, folder: Path) -> Outputs:
-    from lagros_benchmarks.report.delivery import Outputs
-
-    return Outputs(
-        json=folder / "results.json",
-        latex=folder / "table.tex",
-        figure=folder / ("error.png" if task == "cartpole" else "sweep.png"),
-        scene=folder / "scene.png" if task == "spacecraft" else None,
-    )
 
 
 app.command(cls=Command)(watch)

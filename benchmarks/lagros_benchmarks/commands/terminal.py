@@ -72,6 +72,16 @@ class Command(TyperCommand):
         self._refuse_twice(ctx, args)
         return super().parse_args(ctx, args)
 
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help, in which {tasks} and such stand for what the registry says."""
+        from lagros_benchmarks.commands.described import described
+
+        for parameter in self.params:
+            text: str | None = getattr(parameter, "help", None)
+            if text and "{" in text:
+                parameter.help = text.format_map(described())  # type: ignore[attr-defined]
+        super().format_help(ctx, formatter)
+
     def _refuse_twice(self, ctx: Any, args: list[str]) -> None:
         """Refuse an option that stands twice, of which only the last value would count."""
         takes_value = {

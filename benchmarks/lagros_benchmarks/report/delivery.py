@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING
 
 from lagros_benchmarks.commands.outputs import Delivery, Paths, check_outputs
 from lagros_benchmarks.run.process import undone
+from lagros_benchmarks.run.room import room_of
 
 if TYPE_CHECKING:
     from lagros_benchmarks.run.experiment import BenchmarkRun, Row
+    from lagros_envs.task import Described
 
 
 @dataclass(frozen=True)
@@ -27,8 +29,8 @@ class Outputs:
         markdown: The table; success by condition if there are several.
         figure: What is apt: the error or the success and effort of one condition, success and
             effort of several, or success and time against the number of agents.
-        episodes: Every episode (of the spacecraft every agent), one JSON object a line.
-        scene: Trajectories of every policy in one world of spacecraft.
+        episodes: Every episode (of worlds of agents every agent), one JSON object a line.
+        scene: Trajectories of every policy in one world of agents.
         scene_world: Which world of the run that is, from 0.
     """
 
@@ -43,7 +45,7 @@ class Outputs:
 
     def check(
         self,
-        task: str = "cartpole",
+        task: Described | None = None,
         episodes: int | None = None,
         inputs: Paths | None = None,
         folders: Paths | None = None,
@@ -52,7 +54,7 @@ class Outputs:
         """Check the files before the run and not after it.
 
         Args:
-            task: The task of the run.
+            task: The task of the run; None for one without scenes.
             episodes: Its number of episodes; None leaves the scene's world unchecked.
             inputs: Files that the run reads, by the option that names them.
             folders: Where it writes files of its own choice, likewise.
@@ -72,8 +74,9 @@ class Outputs:
                 except ValueError as error:
                     raise ValueError(f"{option}: {error}") from None
         if self.scene is not None:
-            if task != "spacecraft":
-                raise ValueError(f"scene: {task} has none; leave out --scene, or take spacecraft")
+            if task is None or room_of(task).scene is None:
+                name = "the task" if task is None else task.name
+                raise ValueError(f"--scene: {name} has no worlds of agents to draw; leave it out")
             if episodes is not None and not 0 <= self.scene_world < episodes:
                 raise ValueError(
                     f"scene_world={self.scene_world!r} must be one of the run's worlds, 0 to "
@@ -123,13 +126,9 @@ def _draw(rows: list[Row], path: Path) -> None:
 
 
 def _draw_scene(run: BenchmarkRun, world: int, path: Path) -> None:
-    from lagros_benchmarks.run.runner import fly_scene
-    from lagros_benchmarks.tasks.spacecraft.scene_figure import scene_figure
-
     # As in the run: what policies print is not ours, and where they go is no matter.
     with redirect_stdout(sys.stderr), undone():
-        scene = fly_scene(run.settings, world)
-    scene_figure(scene, path)
+        room_of(run.settings.description).part("scene")(run.settings, world, path)
 
 
 def print_report(rows: Sequence[Row]) -> None:
@@ -143,8 +142,8 @@ def print_report(rows: Sequence[Row]) -> None:
     console = Console(highlight=False)
     for group in by_condition(rows):
         console.print(tables.terminal_table(group))
-        if group[0]["task"] == "spacecraft":
-            console.print()  # its tables have no frame, which ends in an empty line
+        if not tables.texts(group[0]).FRAMED:
+            console.print()  # where a frame would end in an empty line
         for line in tables.comparison_lines(group):
             # As text, here and below: names and units may hold what rich takes for markup.
             console.print(Text(line))

@@ -66,7 +66,7 @@ def raised_lines(rows: Sequence[Row]) -> list[str]:
         if not mark(row):
             continue
         filtered = " + filter" if row["safety_filter"] else ""
-        what = "episodes" if row["task"] == "cartpole" else "worlds"
+        what = "worlds" if "agents" in row else "episodes"
         happened = f"{len(row['errors'])} of {row['episodes']} {what} raised and count as failures"
         if not row["errors"]:
             happened = f"{row['timing_raised']} {what} raised where Δt was measured"
@@ -88,8 +88,8 @@ def agents_title(row: Row) -> str:
 
 
 def task_title(row: Row) -> str:
-    """Return the task of a row; of the spacecraft with preset and number of agents."""
-    if row["task"] == "cartpole":
+    """Return the task of a row; of worlds of agents with preset and number of agents."""
+    if "agents" not in row:
         return str(row["task"])
     return f"{row['task']}, {row['preset']}, {agents_title(row)}"
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from lagros_benchmarks.run.experiment import BenchmarkRun, Row
+from lagros_benchmarks.run.room import Room, room_of
+from lagros_benchmarks.run.settings import Case
 from lagros_benchmarks.run.surroundings import machine, own_command, threads, versions
-from lagros_benchmarks.tasks.cartpole import records as cartpole_records
-from lagros_benchmarks.tasks.cartpole.experiment import CartPoleRun
-from lagros_benchmarks.tasks.spacecraft import records as spacecraft_records
-from lagros_benchmarks.tasks.spacecraft.experiment import SpacecraftRun
 
 __all__ = ["Row", "episode_objects", "machine", "summarise", "threads", "versions"]
 
@@ -29,8 +27,6 @@ def summarise(run: BenchmarkRun, command: Sequence[str] | None = None) -> list[R
     Returns:
         The rows, in the order of the conditions and then of the policies.
 
-    Raises:
-        TypeError: The run is of no task that is known here.
     """
     surroundings = {
         "machine": machine(),
@@ -42,23 +38,58 @@ def summarise(run: BenchmarkRun, command: Sequence[str] | None = None) -> list[R
         },
         "command": shlex.join(command if command is not None else own_command()),
     }
-    if isinstance(run, CartPoleRun):
-        rows = cartpole_records.rows(run)
-    elif isinstance(run, SpacecraftRun):
-        rows = spacecraft_records.rows(run)
-    else:
-        raise TypeError(f"there are no rows for a {type(run).__name__}")
-    return [{**row, **surroundings} for row in rows]
+    own = _room(run).part("records")
+    return [
+        {
+            **_identity(run, case),
+            **own.figures(run, case),
+            "raised": sum(one.error is not None for one in episodes),
+            "errors": [{"seed": e.seed, "text": e.error} for e in episodes if e.error is not None],
+            **_compared(run, case, own.comparison),
+            **surroundings,
+        }
+        for case, episodes in run.episodes.items()
+    ]
 
 
 def episode_objects(run: BenchmarkRun) -> Iterable[dict[str, Any]]:
-    """Yield every episode, or every agent of every world, as a JSON object.
+    """Return every episode, or every agent of every world, as a JSON object."""
+    found: Iterable[dict[str, Any]] = _room(run).part("records").episode_objects(run)
+    return found
 
-    Raises:
-        TypeError: The run is of no task that is known here.
-    """
-    if isinstance(run, CartPoleRun):
-        return cartpole_records.episode_objects(run)
-    if isinstance(run, SpacecraftRun):
-        return spacecraft_records.agent_objects(run)
-    raise TypeError(f"there are no episodes in a {type(run).__name__}")
+
+def _room(run: BenchmarkRun) -> Room:
+    return room_of(run.settings.description)
+
+
+def _identity(run: BenchmarkRun, case: Case) -> Row:
+    settings = run.settings
+    worlds = {} if case.agents is None else {"preset": settings.preset, "agents": case.agents}
+    return {
+        "task": settings.description.name,
+        "policy": case.policy,
+        "disturbance": case.condition.kind,
+        "bound": case.condition.bound,
+        "channels": settings.channels,
+        **worlds,
+        "episodes": settings.episodes,
+        "seed": settings.seed,
+        "safety_filter": case.safety_filter,
+    }
+
+
+def _compared(run: BenchmarkRun, case: Case, compare: Callable[[Any, Any], Row]) -> Row:
+    """Compare with every other policy, filtered alike, and with the policy without the filter."""
+    ours = run.episodes[case]
+    row: Row = {
+        "versus": {
+            name: compare(ours, run.episodes[case._replace(policy=name)])
+            for name in run.settings.policies
+            if name != case.policy
+        }
+    }
+    if case.agents is not None:
+        bare = case._replace(safety_filter=False)
+        filtered = case.safety_filter and bare in run.episodes
+        row["filter_effect"] = compare(ours, run.episodes[bare]) if filtered else None
+    return row

@@ -15,8 +15,7 @@ from lagros_benchmarks.report.formats import (
     raised_lines,
 )
 from lagros_benchmarks.run.experiment import Row
-from lagros_benchmarks.tasks.cartpole import tables as cartpole_tables
-from lagros_benchmarks.tasks.spacecraft import tables as spacecraft_tables
+from lagros_benchmarks.run.room import room_named
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -25,34 +24,37 @@ if TYPE_CHECKING:
 
 
 class _Texts(Protocol):
-    """What a module that words the tables of a task has."""
+    """What a module that words the tables of a task has; frames are of tables that have room."""
 
-    COLUMNS: tuple[Column, ...]
-    LEGEND: str
+    FRAMED: bool
 
+    def legend(self, row: Row) -> str: ...
+    def columns(self, row: Row) -> tuple[Column, ...]: ...
     def title(self, row: Row) -> str: ...
     def ordered(self, group: Sequence[Row]) -> Sequence[Row]: ...
     def comparison_lines(self, group: Sequence[Row]) -> Iterator[str]: ...
     def markdown_grids(self, groups: Sequence[Sequence[Row]]) -> list[str]: ...
+    def sweeps(self, rows: Sequence[Row]) -> Iterator[tuple[str, list[str], list[list[str]]]]: ...
 
 
-def columns(row: Row) -> tuple[Column, ...]:
-    """Return the columns of the table of a row's task."""
-    return _texts(row).COLUMNS
+def texts(row: Row) -> _Texts:
+    """Return what words the tables of a row's task."""
+    found: _Texts = room_named(row["task"]).part("tables")
+    return found
 
 
 def legend(rows: Sequence[Row]) -> str:
     """Return what the columns mean."""
-    return _texts(rows[0]).LEGEND
+    return texts(rows[0]).legend(rows[0])
 
 
 def terminal_table(group: Sequence[Row]) -> Table:
     """Return the rich table of the rows of one condition."""
-    texts = _texts(group[0])
-    headings = [f"{heading}\n{unit}".strip() for heading, unit, _ in texts.COLUMNS]
-    contents = [[content(row) for _, _, content in texts.COLUMNS] for row in texts.ordered(group)]
-    # The widest figures of the spacecraft's eight columns leave no room for a frame.
-    return _table(headings, contents, texts.title(group[0]), group[0]["task"] == "cartpole")
+    words = texts(group[0])
+    shown = words.columns(group[0])
+    headings = [f"{heading}\n{unit}".strip() for heading, unit, _ in shown]
+    contents = [[content(row) for _, _, content in shown] for row in words.ordered(group)]
+    return _table(headings, contents, words.title(group[0]), words.FRAMED)
 
 
 def comparison_lines(group: Sequence[Row]) -> Iterator[str]:
@@ -61,14 +63,13 @@ def comparison_lines(group: Sequence[Row]) -> Iterator[str]:
     Args:
         group: Rows of one condition.
     """
-    return _texts(group[0]).comparison_lines(group)
+    return texts(group[0]).comparison_lines(group)
 
 
 def sweep_tables(rows: Sequence[Row]) -> Iterator[tuple[str, Table]]:
     """Yield title and rich table of several conditions side by side, where there are several."""
-    if rows[0]["task"] == "spacecraft":
-        for title, headings, contents in spacecraft_tables.sweeps(rows):
-            yield title, _table(headings, contents)
+    for title, headings, contents in texts(rows[0]).sweeps(rows):
+        yield title, _table(headings, contents)
 
 
 def _table(
@@ -95,10 +96,6 @@ def _table(
         # As text: the name of a file may hold what rich takes for markup.
         table.add_row(*map(Text, line))
     return table
-
-
-def _texts(row: Row) -> _Texts:
-    return cartpole_tables if row["task"] == "cartpole" else spacecraft_tables
 
 
 def error_lines(rows: Sequence[Row], most: int = 5) -> Iterator[str]:
@@ -162,7 +159,7 @@ def latex_text(rows: Sequence[Row]) -> str:
     # A newline in the command would end the comment.
     blocks = ["% " + " ".join(rows[0]["command"].split()) if rows else "% no rows"]
     for group in by_condition(rows):
-        shown = columns(group[0])
+        shown = texts(group[0]).columns(group[0])
         units = [f"{heading} ({unit})" if unit else heading for heading, unit, _ in shown]
         blocks += [
             f"% {condition_title(group[0])}, {group[0]['episodes']} episodes",
@@ -172,7 +169,7 @@ def latex_text(rows: Sequence[Row]) -> str:
             r"\midrule",
             *(
                 " & ".join(_escape(content(row)) for _, _, content in shown) + r" \\"
-                for row in _texts(group[0]).ordered(group)
+                for row in texts(group[0]).ordered(group)
             ),
             r"\bottomrule",
             r"\end{tabular}",
@@ -186,12 +183,12 @@ def markdown_text(rows: Sequence[Row]) -> str:
     groups = by_condition(rows)
     blocks = [f"    {' '.join(rows[0]['command'].split())}"] if rows else []
     if len(groups) > 1:
-        grids = _texts(rows[0]).markdown_grids(groups)
+        grids = texts(rows[0]).markdown_grids(groups)
         return "\n\n".join([*blocks, *grids, *names_lines(rows), *raised_lines(rows)]) + "\n"
     for group in groups:
-        shown = columns(group[0])
+        shown = texts(group[0]).columns(group[0])
         units = [f"{heading} [{unit}]" if unit else heading for heading, unit, _ in shown]
-        ordered = _texts(group[0]).ordered(group)
+        ordered = texts(group[0]).ordered(group)
         contents = [[content(row).strip() for _, _, content in shown] for row in ordered]
         blocks.append(markdown_table(units, contents))
         blocks += _markdown_lines(comparison_lines(group))

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from lagros_benchmarks.run.flying import ask, counted, rehearse, reseed
-from lagros_benchmarks.run.library import Policy
 from lagros_envs.conventions import beyond_the_end
+from lagros_policies.policy import as_policy
 
 
 class ClosedLoop:
@@ -26,9 +26,12 @@ class ClosedLoop:
 
     Args:
         env: The environment; a batch has a row per body in observations and actions.
-        policy: The policy.
+        policy: The policy, or an object with its `predict`.
         past_the_end: Whether what has ended flies on to the time limit. Otherwise it stands in a
             batch with the action zero until the others have ended, too.
+
+    Raises:
+        TypeError: The object has no such `predict`.
 
     Attributes:
         step: Control steps that were taken.
@@ -54,9 +57,9 @@ class ClosedLoop:
     info: dict[str, Any]
     step_times: list[float]
 
-    def __init__(self, env: Any, policy: Policy, past_the_end: bool = False) -> None:
+    def __init__(self, env: Any, policy: Any, past_the_end: bool = False) -> None:
         """Nothing flies yet."""
-        self.env, self.policy = env, policy
+        self.env, self.policy = env, as_policy(policy)
         self._past_the_end = past_the_end
         self._seed: Any = None
         self._clear()

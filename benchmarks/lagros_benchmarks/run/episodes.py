@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.flying import Attempt
-from lagros_benchmarks.run.library import Environment, FloatArray, Policy
+from lagros_benchmarks.run.keeping import Keepable
+from lagros_benchmarks.run.library import Environment, FloatArray
 
 # Both tubes begin with radius zero, where a plan's rounding must not count as leaving them. The
 # planner promises its plans to the same accuracy.
@@ -22,7 +24,7 @@ TIMED_COUNTERS = ("late_plans",)
 
 
 @dataclass(frozen=True)
-class EpisodeRecord:
+class EpisodeRecord(Keepable):
     """What happened in one episode.
 
     Two records are equal if the same happened; how long it took is left out of the comparison.
@@ -85,7 +87,7 @@ def added_up(counters: Iterable[Mapping[str, int]]) -> dict[str, int]:
 
 def run_episode(
     env: Environment,
-    policy: Policy,
+    policy: Any,
     seed: int,
     nominal: FloatArray | None,
     *,
@@ -98,7 +100,7 @@ def run_episode(
 
     Args:
         env: An environment of one body.
-        policy: The policy.
+        policy: The policy, or an object with its `predict`.
         seed: Seed of the episode.
         nominal: x_d at every control instant, or None if there is no plan.
         label: What to call the policy; its own name if None.
@@ -118,7 +120,7 @@ def run_episode(
     # A planner's count of failed plans matters most in the episode that raised.
     with Attempt() as counting:
         counters = loop.counters()
-    name = label or str(getattr(policy, "name", policy))
+    name = label or loop.policy.name
     return _record(loop, name, seed, errors, counters, attempt.error or counting.error)
 
 

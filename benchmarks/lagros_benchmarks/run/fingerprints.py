@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib.util
+import inspect
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -45,6 +46,7 @@ def fingerprint(settings: BenchmarkSettings, toolbox: Toolbox) -> str:
         "settings": record,
         "parallel": settings.backend.in_parallel(settings.jobs),
         "files": {text: _digest(files) for text, files in _named_files(record)},
+        "task": _digest(_task_files(settings.description)),
         "code": _own_code(),
         "toolbox": [_origin(value) for value in vars(toolbox).values()],
         "versions": versions(),
@@ -53,6 +55,14 @@ def fingerprint(settings: BenchmarkSettings, toolbox: Toolbox) -> str:
     }
     text = json.dumps(depends, sort_keys=True, default=repr)
     return hashlib.sha256(text.encode(errors="backslashreplace")).hexdigest()
+
+
+def _task_files(task: Any) -> list[Path]:
+    """Return the file in which a task is described, and its weights."""
+    described = inspect.getsourcefile(type(task))
+    weights = getattr(task, "weights", None)
+    own = [] if described is None else [Path(described)]
+    return own + ([] if weights is None else _files(Path(weights)))
 
 
 def _named_files(value: Any) -> Iterator[tuple[str, list[Path]]]:

@@ -8,7 +8,6 @@ A call that never returns is waited for: there is no time limit on a policy.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterable
 from time import perf_counter
 from types import TracebackType
@@ -17,15 +16,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_benchmarks.run.library import Policy, SetupError, describe_error
+from lagros_benchmarks.run.library import SetupError, describe_error
 from lagros_benchmarks.run.process import ProcessState, undone
 from lagros_envs.seeding import episode_streams
+from lagros_policies.policy import BasePolicy
 
 Float32Array = NDArray[np.float32]
 
 # Exit status of a command that has flown and written everything, where some episodes raised.
 RAISED = 3
-_INTERFACE = "predict(observation, state=None, episode_start=None, deterministic=True)"
 
 
 class AnswerError(ValueError):
@@ -83,7 +82,7 @@ class Attempt:
 
 
 def ask(
-    policy: Policy, observation: Any, state: Any, starts: Any, *shapes: tuple[int, ...]
+    policy: BasePolicy, observation: Any, state: Any, starts: Any, *shapes: tuple[int, ...]
 ) -> Answer:
     """Ask a policy for actions, and check what it answers.
 
@@ -153,23 +152,21 @@ def _said(answer: Any) -> str:
     return "None" if answer is None else f"a value of type {type(answer).__name__}"
 
 
-def reseed(policy: Policy, seed: int) -> None:
+def reseed(policy: BasePolicy, seed: int) -> None:
     """Give a policy that draws the stream of an episode."""
-    draw = getattr(policy, "reseed", None)
-    if draw is not None:
-        draw(episode_streams(seed).policy)
+    if policy.draws:
+        policy.reseed(episode_streams(seed).policy)
 
 
-def counted(policy: Policy, state: Any) -> dict[str, int]:
+def counted(policy: BasePolicy, state: Any) -> dict[str, int]:
     """Return what a policy has counted in its memory; nothing for one that counts nothing."""
-    counters = getattr(policy, "counters", None)
-    if counters is None or state is None:
+    if state is None:
         return {}
-    return {str(name): int(count) for name, count in counters(state).items()}
+    return {str(name): int(count) for name, count in policy.counters(state).items()}
 
 
 def rehearse(
-    what: str, policy: Policy, observation: Any, starts: Any, *shapes: tuple[int, ...]
+    what: str, policy: BasePolicy, observation: Any, starts: Any, *shapes: tuple[int, ...]
 ) -> None:
     """Ask a policy once before it flies, so that one that cannot run ends the command at once.
 
@@ -184,10 +181,8 @@ def rehearse(
         shapes: As for `ask`.
 
     Raises:
-        SetupError: It has no `predict` that can be called as it must be, a package is missing, or
-            it answers by something that is no action of this task.
+        SetupError: A package is missing, or it answers by something that is no action of this task.
     """
-    check_interface(what, policy)
     try:
         with undone():
             reseed(policy, 0)
@@ -204,29 +199,6 @@ def describe(error: Exception) -> str:
     """Return the text of an exception on one line, after its type unless it is ours."""
     text = describe_error(error)
     return text.partition(": ")[2] if isinstance(error, AnswerError) else text
-
-
-def check_interface(what: str, policy: Any) -> None:
-    """Check that a policy can be called as all are.
-
-    Raises:
-        SetupError: It cannot.
-    """
-    if inspect.isclass(policy):
-        raise SetupError(f"{what} is the class {policy.__name__}; it must be an object of it")
-    predict = getattr(policy, "predict", None)
-    if not callable(predict):
-        raise SetupError(f"{what} cannot fly: a {type(policy).__name__} has no method {_INTERFACE}")
-    try:
-        signature = inspect.signature(predict)
-    except (TypeError, ValueError):
-        return  # written in C, it does not tell
-    try:
-        signature.bind(None, None, None, True)
-    except TypeError as error:
-        raise SetupError(
-            f"{what} cannot fly: predict{signature} {error}; it must be {_INTERFACE}"
-        ) from None
 
 
 def raised_line(raised: Iterable[tuple[str, int, int]]) -> str:

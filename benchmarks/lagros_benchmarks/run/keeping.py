@@ -17,18 +17,21 @@ from typing import Any
 
 import numpy as np
 
-from lagros_benchmarks.run.episodes import EpisodeRecord
-from lagros_benchmarks.tasks.cartpole.experiment import NominalPlan
-from lagros_benchmarks.tasks.spacecraft.episodes import AgentRecord, Flight, WorldRecord
-from lagros_benchmarks.tasks.spacecraft.timing import Timing
 from lagros_envs.files import write_atomic
 
-__all__ = ["Kept", "decode", "encode"]
+__all__ = ["Keepable", "Kept", "decode", "encode"]
 
 _LOG = logging.getLogger(__name__)
-# All that the chunks of the experiments are made of.
-_RECORDS = (NominalPlan, EpisodeRecord, Flight, WorldRecord, AgentRecord, Timing)
-_TYPES: Mapping[str, Any] = {record.__name__: record for record in _RECORDS}
+_KEEPABLE: dict[str, Any] = {}
+
+
+class Keepable:
+    """A dataclass that chunks are made of; whoever derives from it is read back by its name."""
+
+    def __init_subclass__(cls) -> None:
+        """Know the class."""
+        super().__init_subclass__()
+        _KEEPABLE[cls.__name__] = cls
 
 
 class Kept:
@@ -124,7 +127,7 @@ def encode(value: Any) -> Any:
         return {"array": value.tolist(), "shape": value.shape, "dtype": value.dtype.str}
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
         return {"dict": {key: encode(item) for key, item in value.items()}}
-    if type(value) in _RECORDS:
+    if _KEEPABLE.get(type(value).__name__) is type(value):
         fields = dataclasses.fields(value)
         return {
             "record": type(value).__name__,
@@ -145,4 +148,6 @@ def decode(data: Any) -> Any:
         return np.array(data["array"], data["dtype"]).reshape(data["shape"])
     if "dict" in data:
         return {key: decode(item) for key, item in data["dict"].items()}
-    return _TYPES[data["record"]](**{name: decode(item) for name, item in data["fields"].items()})
+    return _KEEPABLE[data["record"]](
+        **{name: decode(item) for name, item in data["fields"].items()}
+    )

@@ -6,19 +6,21 @@ imports only what its chunk needs.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.run.process import undone
-from lagros_benchmarks.tasks.spacecraft.claims import position_margin
+from lagros_policies.policy import BasePolicy, as_policy
+
+if TYPE_CHECKING:
+    from lagros_policies.planning.planner import Planner
 
 FloatArray = NDArray[np.float64]
 Environment = gym.Env[Any, Any]
@@ -55,28 +57,6 @@ class SetupError(Exception):
         return cls(own if own.startswith(what) else f"{what} cannot be built: {text}")
 
 
-# What a policy may have beside `predict`.
-_OPTIONAL = ("name", "observes", "policy", "reseed", "counters", "bare_forward", "example_features")
-
-
-def check_observes(what: str, policy: Any) -> None:
-    """Check that a policy says rightly what it is fed, where it says it, and what it has.
-
-    Args:
-        what: As for `SetupError.building`.
-        policy: The policy.
-
-    Raises:
-        SetupError: It does not.
-    """
-    with building(what):
-        for name in _OPTIONAL:
-            getattr(policy, name, None)  # a property may raise
-        observes = getattr(policy, "observes", "local")
-        if observes not in ("local", "global"):
-            raise SetupError(f'{what} has observes={observes!r}; it must be "local" or "global"')
-
-
 @contextmanager
 def building(what: str) -> Iterator[None]:
     """Turn whatever the constructor of a stranger raises, SystemExit too, into a `SetupError`.
@@ -96,74 +76,32 @@ def building(what: str) -> Iterator[None]:
         raise SetupError.building(what, error) from error
 
 
-class Policy(Protocol):
-    """What an episode needs of a policy: `predict` of stable-baselines3's protocol.
-
-    A policy may also have `counters(state) -> dict[str, int]`, `reseed(generator)` for what it
-    draws itself, and a `BareNetwork`. One of the spacecraft says by `observes` whether it is fed
-    the rows of all agents ("local") or `state()` of all worlds ("global").
-    """
-
-    def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[Any, Any]:
-        """Return the action and the policy's state."""
-        ...
-
-
-@runtime_checkable
-class BareNetwork(Protocol):
-    """What a policy has whose network can be timed alone."""
-
-    def bare_forward(self, features: Any) -> Any:
-        """Evaluate the network."""
-        ...
-
-    def example_features(self) -> Any:
-        """Return an input of it."""
-        ...
-
-
-class Plan(Protocol):
-    """A planned trajectory: `states` (N + 1, n), whether it is `solved`, and its `defect`."""
-
-    @property
-    def states(self) -> Any:
-        """x_d at every control instant, shape (N + 1, n)."""
-        ...
-
-    @property
-    def solved(self) -> bool:
-        """Whether the planner vouches for it."""
-        ...
-
-    @property
-    def defect(self) -> float:
-        """The largest violation of the dynamics, in units of the state."""
-        ...
-
-
-class Planner(Protocol):
-    """Plans an episode from its start to its goal."""
-
-    def plan(self, initial_state: Any, goal: Any) -> Plan:
-        """Return the plan."""
-        ...
-
-
-def make_policy(name: str, env: Any, settings: Mapping[str, Any]) -> Policy:
+def make_policy(name: str, env: Any, settings: Mapping[str, Any]) -> Any:
     """Build a policy from its name or file."""
     import lagros_policies
 
-    policy: Policy = lagros_policies.make(name, env, **settings)
-    return policy
+    return lagros_policies.make(name, env, **settings)
 
 
-def make_single_policy(name: str, env: Any) -> Policy:
+def built_policy(name: str, make: Callable[[], Any]) -> BasePolicy:
+    """Build a policy, of which then everything can be asked.
+
+    Args:
+        name: The policy, as the run was asked for it.
+        make: Builds it.
+
+    Raises:
+        SetupError: It cannot be built, or is no policy.
+    """
+    with building(f"policy {name!r}"):
+        made = make()
+        try:
+            return as_policy(made, name)
+        except TypeError as error:
+            raise SetupError(str(error)) from None
+
+
+def make_single_policy(name: str, env: Any) -> BasePolicy:
     """Build the policy of a command that flies one.
 
     Raises:
@@ -176,41 +114,27 @@ def make_single_policy(name: str, env: Any) -> Policy:
     try:
         with undone():
             policy = make_policy(name, env, {})
-        check_observes(f"policy {name!r}", policy)
-        return policy
-    except (SetupError, ValueError, OSError, ImportError, KeyboardInterrupt):
+    except (ValueError, OSError, ImportError, KeyboardInterrupt):
         raise
     except BaseException as error:
         raise SetupError.building(f"policy {name!r}", error) from error
+    return built_policy(name, lambda: policy)
 
 
-def make_filter(policy: Any, env: Any, disturbance_bound: float) -> Policy:
-    """Return a policy with the safety filter of its task.
+def make_planner(task: Any) -> Planner:
+    """Return the planner whose cold plans are the nominal trajectories x_d of a task's episodes."""
+    from lagros_policies.planning.planner import planner_of
 
-    Args:
-        policy: The policy.
-        env: An environment whose task has one.
-        disturbance_bound: d_bar, in units of the state per second.
-    """
-    room = importlib.import_module(f"lagros_policies.tasks.{env.settings.room}")
-    filtered: Policy = room.filtered(policy, env, disturbance_bound)
-    return filtered
+    return planner_of(task)
 
 
-def make_planner() -> Planner:
-    """Return the planner whose cold plans are the nominal trajectories x_d of the episodes."""
-    from lagros_policies.tasks.cartpole.planner import CartPolePlanner
-
-    planner: Planner = CartPolePlanner()
-    return planner
-
-
-def load_metric(path: str | None) -> Callable[[FloatArray], FloatArray]:
-    """Return M(x), states (..., n) to (..., n, n), of the shipped metric or of a file."""
+def load_metric(task: Any, path: str | None) -> Callable[[FloatArray], FloatArray]:
+    """Return M(x), states (..., n) to (..., n, n), of the task's own metric or of a file."""
     from lagros_policies.contraction import load_metric as load
+    from lagros_policies.expert import metric_of
 
-    matrix: Callable[[FloatArray], FloatArray] = load(path, states=4).matrix
-    return matrix
+    metric = metric_of(task) if path is None else load(path, task.system.state_dim)
+    return metric.matrix
 
 
 @dataclass(frozen=True)
@@ -218,20 +142,21 @@ class Toolbox:
     """The functions above, in one value that travels to the workers and that a test can replace.
 
     Attributes:
-        make_policy: Name, environment and settings to a policy.
-        make_planner: The planner of the nominal trajectories.
-        load_metric: File or None to M(x).
-        make_filter: Policy, spacecraft environment and bound to the policy with the safety filter.
+        make_policy: Name, environment and settings to a policy, or to an object that can be one.
+        make_planner: Task to the planner of the nominal trajectories.
+        load_metric: Task, and file or None, to M(x).
+        make_filter: Policy, environment and bound to the policy with the safety filter; None, as
+            in the next, for that of the task.
         position_margin: Policy and bound to the certified bound of its position error, or None.
     """
 
-    make_policy: Callable[[str, Any, Mapping[str, Any]], Policy] = make_policy
-    make_planner: Callable[[], Planner] = make_planner
-    load_metric: Callable[[str | None], Callable[[FloatArray], FloatArray]] = load_metric
-    make_filter: Callable[[Policy, Any, float], Policy] = make_filter
-    position_margin: Callable[[Any, float], float | None] = position_margin
+    make_policy: Callable[[str, Any, Mapping[str, Any]], Any] = make_policy
+    make_planner: Callable[[Any], Planner] = make_planner
+    load_metric: Callable[[Any, str | None], Callable[[FloatArray], FloatArray]] = load_metric
+    make_filter: Callable[[BasePolicy, Any, float], BasePolicy] | None = None
+    position_margin: Callable[[BasePolicy, float], float | None] | None = None
 
-    def with_policies(self, policies: Mapping[str, Policy]) -> Toolbox:
+    def with_policies(self, policies: Mapping[str, Any]) -> Toolbox:
         """Return the same with some policies that are objects, by name.
 
         Args:
@@ -249,10 +174,10 @@ class GivenPolicies:
         otherwise: Makes all others.
     """
 
-    objects: Mapping[str, Policy]
-    otherwise: Callable[[str, Any, Mapping[str, Any]], Policy]
+    objects: Mapping[str, Any]
+    otherwise: Callable[[str, Any, Mapping[str, Any]], Any]
 
-    def __call__(self, name: str, env: Any, settings: Mapping[str, Any]) -> Policy:
+    def __call__(self, name: str, env: Any, settings: Mapping[str, Any]) -> Any:
         """Make a policy.
 
         Raises:

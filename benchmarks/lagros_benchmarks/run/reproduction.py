@@ -1,4 +1,4 @@
-"""A task's experiment from nothing: what the runs of both tasks have in common."""
+"""A task's experiment from nothing: what the runs of all tasks have in common."""
 
 from __future__ import annotations
 
@@ -24,6 +24,16 @@ class Reproduction(Protocol):
     @property
     def free(self) -> tuple[str, ...]:
         """Names of the settings that may change when a run goes on: they change no file of it."""
+
+    @classmethod
+    def for_task(cls, task: str, episodes: int | None, **asked: Any) -> Reproduction:
+        """Return the settings of a run.
+
+        Args:
+            task: The task, as it was asked for.
+            episodes: Episodes, or worlds, of each policy in the table; None for the usual number.
+            asked: `jobs` and `backend`.
+        """
 
     def make(self, folder: Path, progress: Progress, say: Say) -> None:
         """Make what is not yet in the folder."""

@@ -10,19 +10,22 @@ import importlib
 from dataclasses import dataclass
 from typing import Any
 
+from lagros_envs.registry import task_named, task_names
 from lagros_envs.task import Described
 
 
 @dataclass(frozen=True)
 class Room:
-    """Places of the parts, as module:attribute; each is imported when it is asked for.
+    """Places of the parts, each module:attribute or a module, imported when it is asked for.
 
     Attributes:
-        experiment: An `Experiment`'s constructor, from settings and toolbox.
-        rows: The rows of a run.
-        episodes: The objects of a run's episodes.
-        tables: The texts and columns of its tables.
-        figures: Its figures.
+        experiment: An `Experiment`, whose `set_up` takes settings and toolbox.
+        records: A module with the figures of its rows, and with its episodes as objects.
+        tables: A module with the texts and columns of its tables.
+        figures: Draws rows into a file.
+        scene: Draws what every policy made of one world of a run; None without, as the next.
+        fly_scene: Flies that world.
+        reproduced: Name of the figure of `lagros reproduce`.
         game: What `lagros watch` plays.
         attack: Episodes and search of an attack, a `worst_case.attack.Bench`.
         certify: The certificate.
@@ -32,10 +35,12 @@ class Room:
     """
 
     experiment: str = "lagros_benchmarks.run.single:SingleExperiment"
-    rows: str = "lagros_benchmarks.report.single:rows"
-    episodes: str = "lagros_benchmarks.report.single:episode_objects"
-    tables: str = "lagros_benchmarks.report.single_tables:TABLES"
+    records: str = "lagros_benchmarks.report.single"
+    tables: str = "lagros_benchmarks.report.single_tables"
     figures: str = "lagros_benchmarks.report.single_figures:draw"
+    scene: str | None = None
+    fly_scene: str | None = None
+    reproduced: str = "error.png"
     game: str = "lagros_benchmarks.report.watched:SingleGame"
     attack: str = "lagros_benchmarks.worst_case.single:SingleBench"
     certify: str = "lagros_benchmarks.evidence.single:certify"
@@ -46,7 +51,8 @@ class Room:
     def part(self, name: str) -> Any:
         """Import one of the parts by the name of its attribute."""
         module, _, attribute = str(getattr(self, name)).partition(":")
-        return getattr(importlib.import_module(module), attribute)
+        found = importlib.import_module(module)
+        return getattr(found, attribute) if attribute else found
 
 
 def room_of(task: Described) -> Room:
@@ -55,3 +61,11 @@ def room_of(task: Described) -> Room:
         return Room()
     found: Room = importlib.import_module(f"lagros_benchmarks.tasks.{task.room}").ROOM
     return found
+
+
+def room_named(task: str) -> Room:
+    """Return the room of a task by the name that stands in its rows.
+
+    A task that is not known here, of rows that were read from a file, has one body.
+    """
+    return room_of(task_named(task)) if task in task_names() else Room()

@@ -14,14 +14,11 @@ from typing import Any
 from lagros_benchmarks.run.experiment import BenchmarkRun, Experiment
 from lagros_benchmarks.run.fingerprints import fingerprint
 from lagros_benchmarks.run.keeping import Kept
-from lagros_benchmarks.run.library import Policy, Toolbox
+from lagros_benchmarks.run.library import Toolbox
+from lagros_benchmarks.run.room import room_of
 from lagros_benchmarks.run.settings import BenchmarkSettings, Case
 from lagros_benchmarks.run.workers import Progress, gather, split
-from lagros_benchmarks.tasks.cartpole.experiment import CartPoleExperiment
-from lagros_benchmarks.tasks.spacecraft.experiment import Scene, SpacecraftExperiment
-from lagros_benchmarks.tasks.spacecraft.experiment import fly_scene as fly_world
 from lagros_envs.checks import check_instance, shown
-from lagros_envs.registry import task_named
 from lagros_policies.backends import running
 
 __all__ = [
@@ -42,10 +39,9 @@ def make_experiment(settings: BenchmarkSettings, toolbox: Toolbox | None = None)
         SetupError: A policy, the planner or the metric cannot be built.
     """
     check_instance("settings", settings, BenchmarkSettings)
-    toolbox = toolbox or Toolbox()
-    if settings.task == "cartpole":
-        return CartPoleExperiment.set_up(settings, toolbox)
-    return SpacecraftExperiment.set_up(settings, toolbox)
+    kind = room_of(settings.description).part("experiment")
+    made: Experiment = kind.set_up(settings, toolbox or Toolbox())
+    return made
 
 
 def kept_in(
@@ -65,7 +61,7 @@ def kept_in(
     """
     check_instance("settings", settings, BenchmarkSettings)
     key = fingerprint(settings, toolbox or Toolbox())
-    return Kept(Path(folder) / f"{settings.task}-{key[:16]}", key)
+    return Kept(Path(folder) / f"{settings.description.name}-{key[:16]}", key)
 
 
 def run_benchmark(
@@ -73,7 +69,7 @@ def run_benchmark(
     toolbox: Toolbox | None = None,
     progress: Progress | None = None,
     kept: Kept | None = None,
-    policies: Mapping[str, Policy] | None = None,
+    policies: Mapping[str, Any] | None = None,
 ) -> BenchmarkRun:
     """Run every policy under every condition on the same episodes.
 
@@ -132,9 +128,9 @@ def fly_scene(
     settings: BenchmarkSettings,
     world: int = 0,
     toolbox: Toolbox | None = None,
-    policies: Mapping[str, Policy] | None = None,
-) -> Scene:
-    """Fly one world of a spacecraft benchmark again and keep where everybody was.
+    policies: Mapping[str, Any] | None = None,
+) -> Any:
+    """Fly one world of a benchmark of many agents again and keep where everybody was.
 
     Args:
         settings: Those of the run.
@@ -147,16 +143,16 @@ def fly_scene(
     """
     if policies:
         settings, toolbox = _with_policies(settings, toolbox, policies)
-    return fly_world(settings, world, toolbox or Toolbox())
+    return room_of(settings.description).part("fly_scene")(settings, world, toolbox or Toolbox())
 
 
 def _with_policies(
-    settings: BenchmarkSettings, toolbox: Toolbox | None, policies: Mapping[str, Policy]
+    settings: BenchmarkSettings, toolbox: Toolbox | None, policies: Mapping[str, Any]
 ) -> tuple[BenchmarkSettings, Toolbox]:
     """Return settings that name all policies and a toolbox that makes them."""
     from lagros_policies.policy import policy_names
 
-    taken = policy_names(task_named(settings.task))
+    taken = policy_names(settings.description)
     if not isinstance(policies, Mapping):
         raise ValueError(f"policies={shown(policies)} must be a dictionary of objects by name")
     for name in policies:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 from lagros_envs.checks import (
@@ -16,11 +17,11 @@ from lagros_envs.checks import (
     suggestion,
 )
 from lagros_envs.disturbances import KINDS
-from lagros_envs.registry import task_named
+from lagros_envs.registry import find_task, task_names
 from lagros_envs.seeding import EVALUATION, episode_seeds
+from lagros_envs.task import Defaults, Described
 from lagros_policies.backends import LOKY, Backend
 
-TASKS = ("cartpole", "spacecraft")
 CHANNELS = ("all", "rates")
 # Whether policies fly without a safety filter, with it, or both one after the other.
 SAFETY_FILTERS: dict[str, tuple[bool, ...]] = {
@@ -28,20 +29,7 @@ SAFETY_FILTERS: dict[str, tuple[bool, ...]] = {
     "all": (True,),
     "both": (False, True),
 }
-DEFAULT_POLICIES = ("learned", "tube-mpc", "lagros", "lqr")
-# What a task wants in place of the defaults of `BenchmarkSettings`.
-DEFAULTS: dict[str, dict[str, Any]] = {
-    "cartpole": {},
-    "spacecraft": {
-        "policies": ("learned", "tube-mpc", "lagros", "centralized"),
-        "bounds": (0.2, 0.4, 0.6, 0.8, 1.0),
-        "preset": "paper",
-        "agents": (6,),
-        "safety_filter": "both",
-    },
-}
-# Bound of a comparison of numbers of agents, which has no use for a sweep over bounds.
-SCALE_BOUNDS = (0.4,)
+_USUAL = Defaults()
 # What is kept of an episode lies in memory, and every job is a process.
 _MOST = {"episodes": 1_000_000, "jobs": 1024, "chunk": 1_000_000, "timing_episodes": 1_000_000}
 
@@ -64,8 +52,8 @@ class Case(NamedTuple):
     Attributes:
         policy: Policy, as the run was asked for it.
         condition: The disturbance.
-        safety_filter: Whether it wears the safety filter.
-        agents: Agents of each world; None for the cart-pole.
+        safety_filter: Whether it uses the safety filter.
+        agents: Agents of each world; None for a task of one body.
     """
 
     policy: str
@@ -81,12 +69,21 @@ def unknown_name(what: str, given: object, valid: Iterable[str], note: str = "")
     return f"unknown {what} {shown(given)}.{hint} Valid: {', '.join(names)}{note}."
 
 
-def check_policy(name: str, task: str = "cartpole") -> None:
+def check_task(task: str) -> None:
+    """Check that there is a task.
+
+    Raises:
+        ValueError: There is none.
+    """
+    find_task(task)
+
+
+def check_policy(name: str, task: str | None = None) -> None:
     """Check that a policy is a known name, an existing file or an importable module.
 
     Args:
         name: The policy.
-        task: The task whose names count.
+        task: The task whose names count; the first if left out.
 
     Raises:
         ValueError: It is neither.
@@ -94,7 +91,7 @@ def check_policy(name: str, task: str = "cartpole") -> None:
     from lagros_policies.naming import is_file, is_importable, model_file, user_class
     from lagros_policies.policy import policy_names
 
-    names = policy_names(task_named(task))
+    names = policy_names(find_task(task or task_names()[0]))
     if name in names:
         return
     model = model_file(name)
@@ -114,14 +111,23 @@ def check_policy(name: str, task: str = "cartpole") -> None:
     )
 
 
-def check_task(task: str) -> None:
-    """Check the name of a task.
+def check_fits(task: Described, **given: Any) -> None:
+    """Check that what is asked of a run of many agents is not asked of one body.
+
+    Args:
+        task: The task.
+        given: Settings by name; None, False or empty where they are left out.
 
     Raises:
-        ValueError: The task is unknown.
+        ValueError: One is given, and the task has one body.
     """
-    if not isinstance(task, str) or task not in TASKS:
-        raise ValueError(unknown_name("task", task, TASKS))
+    if task.most_agents > 1:
+        return
+    for name, value in given.items():
+        if value and value != "none":
+            raise ValueError(
+                f"{name}={shown(value)} does not fit: {task.name} is one body; leave it out"
+            )
 
 
 @dataclass(frozen=True)
@@ -129,18 +135,18 @@ class BenchmarkSettings:
     """Policies side by side on the same episodes.
 
     Attributes:
-        task: Name of the task.
-        policies: Names of `lagros_policies.NAMES`, or files of stable-baselines3 models.
+        task: Name of the task, or where it is: module:attribute or a .py file.
+        policies: Names of the task's policies, files of stable-baselines3 models, or module:Class.
         episodes: Episodes of each policy under each condition; worlds, with agents.
         seed: Seed of the run. Its episodes belong to the namespace `EVALUATION` of
             `lagros_envs.seeding`, so they are never those of a training run, of whatever seed.
         disturbances: Kinds of disturbance.
         bounds: d_bar, in units of the state per second; every kind meets every bound.
         channels: Disturbed states, "all" or "rates".
-        metric: File of the contraction metric for the kind "worst"; None takes the shipped one.
-        preset: Preset of the spacecraft's scenarios; None for the cart-pole, as the next two.
-        agents: Numbers of spacecraft in a world; several compare them.
-        safety_filter: "none", "all" policies wear the filter, or "both" one after the other.
+        metric: File of the contraction metric for the kind "worst"; None takes the task's own.
+        preset: Kind of worlds; None for a task of one body, as the next two.
+        agents: Numbers of agents in a world; several compare them.
+        safety_filter: "none", "all" policies use the filter, or "both" one after the other.
         policy_settings: Further settings of `lagros_policies.make`, by policy.
         jobs: Worker processes.
         chunk: Episodes that a worker takes at a time; worlds that fly in one batch.
@@ -153,12 +159,12 @@ class BenchmarkSettings:
         ValueError: A setting is not valid.
     """
 
-    task: str = "cartpole"
-    policies: tuple[str, ...] = DEFAULT_POLICIES
-    episodes: int = 50
+    task: str = field(default_factory=lambda: task_names()[0])
+    policies: tuple[str, ...] = _USUAL.policies
+    episodes: int = _USUAL.episodes
     seed: int = 0
     disturbances: tuple[str, ...] = ("uniform",)
-    bounds: tuple[float, ...] = (0.75,)
+    bounds: tuple[float, ...] = _USUAL.bounds
     channels: str = "all"
     metric: str | None = None
     preset: str | None = None
@@ -173,10 +179,10 @@ class BenchmarkSettings:
     def __post_init__(self) -> None:
         """Check the settings."""
         check_fields(self)
-        check_task(self.task)
+        task = self.description
         for name in ("policies", "disturbances", "bounds", "agents"):
             values = getattr(self, name)
-            if not values and not (name == "agents" and self.task == "cartpole"):
+            if not values and not (name == "agents" and task.most_agents == 1):
                 raise ValueError(f"{name} must not be empty")
             twice = [value for value, count in Counter(values).items() if count > 1]
             if twice:
@@ -191,11 +197,19 @@ class BenchmarkSettings:
         for name, most in _MOST.items():
             check_whole(name, getattr(self, name), 1, most)
         check_seed(self.seed)
-        if self.task == "cartpole":
-            self._check_alone()
-        else:
-            self._check_spacecraft()
+        check_fits(task, preset=self.preset, agents=self.agents, safety_filter=self.safety_filter)
+        if task.most_agents > 1:
+            self._check_worlds(task)
         self._check_policy_settings()
+
+    @cached_property
+    def description(self) -> Described:
+        """The task, which travels to worker processes that may not know of it.
+
+        Raises:
+            ValueError: There is no such task.
+        """
+        return find_task(self.task)
 
     def _check_policy_settings(self) -> None:
         given = self.policy_settings
@@ -212,28 +226,18 @@ class BenchmarkSettings:
         if strangers:
             raise ValueError(f"policy_settings names {strangers}, which do not run")
 
-    def _check_alone(self) -> None:
-        for name, none in (("preset", None), ("agents", ()), ("safety_filter", "none")):
-            if getattr(self, name) != none:
-                raise ValueError(
-                    f"{name}={getattr(self, name)!r} is for the task spacecraft; leave it out for "
-                    "cartpole"
-                )
-
-    def _check_spacecraft(self) -> None:
-        from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS
-
-        if self.preset not in PRESETS:
-            raise ValueError(unknown_name("preset", self.preset, PRESETS))
+    def _check_worlds(self, task: Described) -> None:
+        if self.preset not in task.presets:
+            raise ValueError(unknown_name("preset", self.preset, task.presets))
         if self.safety_filter not in SAFETY_FILTERS:
             raise ValueError(unknown_name("safety filter", self.safety_filter, SAFETY_FILTERS))
         for count in self.agents:
-            check_whole("agents", count, 1, MOST_AGENTS)
+            check_whole("agents", count, 1, task.most_agents)
         if "worst" in self.disturbances:
             raise ValueError(
                 "disturbance 'worst' pushes away from one nominal trajectory that all policies "
-                "share, which the spacecraft's do not: each makes its own way, and `lagros attack "
-                "spacecraft` searches the worst of each. Valid: "
+                f"share, which those of {task.name} do not: each makes its own way, and `lagros "
+                f"attack {task.name}` searches the worst of each. Valid: "
                 f"{', '.join(kind for kind in KINDS if kind != 'worst')}."
             )
 
@@ -248,11 +252,12 @@ class BenchmarkSettings:
         Raises:
             ValueError: A setting is not valid.
         """
-        check_task(task)
+        usual = find_task(task).defaults
         chosen = {name: value for name, value in given.items() if value is not None}
-        defaults = DEFAULTS[task]
-        if len(chosen.get("agents", ())) > 1:
-            defaults = defaults | {"bounds": SCALE_BOUNDS}
+        # A comparison of numbers of agents has no use for a sweep over bounds.
+        bounds = (usual.bound,) if len(chosen.get("agents", ())) > 1 else usual.bounds
+        names = ("policies", "episodes", "agents", "preset", "safety_filter")
+        defaults = {name: getattr(usual, name) for name in names} | {"bounds": bounds}
         return cls(task=task, **(defaults | chosen))
 
     @property

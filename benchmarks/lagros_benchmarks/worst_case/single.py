@@ -13,7 +13,7 @@ import numpy as np
 from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.episodes import TUBE_TOLERANCE
 from lagros_benchmarks.run.flying import Attempt
-from lagros_benchmarks.run.library import Policy, make_single_policy
+from lagros_benchmarks.run.library import make_single_policy
 from lagros_benchmarks.worst_case.certificate import TubeCheck
 from lagros_benchmarks.worst_case.flights import (
     Episodes,
@@ -38,6 +38,7 @@ from lagros_envs.disturbances import onto_unit_sphere
 from lagros_envs.registry import find_task
 from lagros_envs.task import LARGEST_DISTANCE, Task
 from lagros_policies.contraction import ContractionMetric
+from lagros_policies.policy import BasePolicy
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
 # States and plans (b, n) to directions (b, n).
@@ -257,7 +258,7 @@ class SingleBench:
 
 
 def replay_single(
-    episodes: Episodes, index: int, policy: Policy, goal: str, pushes: FloatArray
+    episodes: Episodes, index: int, policy: BasePolicy, goal: str, pushes: FloatArray
 ) -> tuple[Outcome, Flights | None]:
     """Fly one sequence in the environment.
 
@@ -306,7 +307,7 @@ def replay_single(
 
 
 def _flight(
-    env: Any, policy: Policy, seed: int, nominal: FloatArray
+    env: Any, policy: BasePolicy, seed: int, nominal: FloatArray
 ) -> tuple[Flights, dict[str, Any]]:
     task: Task = env.settings
     loop = ClosedLoop(env, policy)

@@ -68,6 +68,11 @@ class ReproduceSettings:
 
     free: ClassVar[tuple[str, ...]] = ("jobs", "backend", "episodes", "seed", "bound")
 
+    @classmethod
+    def for_task(cls, task: str, episodes: int | None, **asked: Any) -> ReproduceSettings:
+        """Return the settings of a run; see `run.reproduction.Reproduction`."""
+        return cls(**asked | ({} if episodes is None else {"episodes": episodes}))
+
     def __post_init__(self) -> None:
         """Check, before hours of work, what the benchmark at their end will ask."""
         check_fields(self)

@@ -2,9 +2,19 @@
 
 from lagros_benchmarks.run.room import Room
 
+_HERE = "lagros_benchmarks.tasks.spacecraft"
+
 ROOM = Room(
-    attack="lagros_benchmarks.tasks.spacecraft.attack:SpacecraftBench",
-    game="lagros_benchmarks.tasks.spacecraft.game:SpacecraftGame",
-    demonstrations="lagros_benchmarks.tasks.spacecraft.demonstrations:SpacecraftExpert",
-    certify="lagros_benchmarks.tasks.spacecraft.certify:certify",
+    experiment=f"{_HERE}.experiment:SpacecraftExperiment",
+    records=f"{_HERE}.records",
+    tables=f"{_HERE}.tables",
+    figures=f"{_HERE}.figures:draw",
+    scene=f"{_HERE}.scene_figure:draw_scene",
+    fly_scene=f"{_HERE}.experiment:fly_scene",
+    reproduced="sweep.png",
+    game=f"{_HERE}.game:SpacecraftGame",
+    demonstrations=f"{_HERE}.demonstrations:SpacecraftExpert",
+    attack=f"{_HERE}.attack:SpacecraftBench",
+    certify=f"{_HERE}.certify:certify",
+    reproduce=f"{_HERE}.reproduce:SpacecraftReproduceSettings",
 )

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.run.flying import Attempt
-from lagros_benchmarks.run.library import building, make_filter, make_single_policy
+from lagros_benchmarks.run.library import building, make_single_policy
 from lagros_benchmarks.tasks.spacecraft.claims import position_margin
-from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, bare
+from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, make_filter
 from lagros_benchmarks.tasks.spacecraft.plane import worst_plane_pushes
 from lagros_benchmarks.tasks.spacecraft.worst_case import (
     PARAMETERS,
@@ -194,7 +194,7 @@ def search_adversary(
 
 def _fly_known(target: SpacecraftTarget) -> Found:
     """Fly the sequence that is the worst for the position error of any agent that is tracked."""
-    tracking: Any = getattr(bare(target.policy), "tracking", None)
+    tracking: Any = target.policy.bare.tracking
     paper = task.SpacecraftSettings()
     along = worst_plane_pushes(tracking, target.bound, paper.steps)
     sequence = np.zeros((paper.steps, target.agents, task.STATE_DIM))

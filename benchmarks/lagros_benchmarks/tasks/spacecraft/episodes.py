@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.episodes import TUBE_TOLERANCE, added_up
 from lagros_benchmarks.run.flying import Attempt
-from lagros_benchmarks.run.library import FloatArray, Policy
+from lagros_benchmarks.run.keeping import Keepable
+from lagros_benchmarks.run.library import FloatArray
 from lagros_envs.tasks.spacecraft.task import THRUSTERS
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+from lagros_policies.policy import BasePolicy, as_policy
 
 BoolArray = NDArray[np.bool_]
 
-# Memories of a policy within those of what it wears.
+# Memories of a policy within those of the filters that it uses.
 _MOST_WRAPPED = 4
 _MEASURES = (
     *("success", "success_time", "strict_success", "paper_success", "collided", "collision_time"),
@@ -32,7 +34,7 @@ _MEASURES = (
 
 
 @dataclass(frozen=True)
-class AgentRecord:
+class AgentRecord(Keepable):
     """What happened to one agent.
 
     Attributes:
@@ -66,7 +68,7 @@ class AgentRecord:
 
 
 @dataclass(frozen=True)
-class WorldRecord:
+class WorldRecord(Keepable):
     """What happened in one world.
 
     Attributes:
@@ -84,7 +86,7 @@ class WorldRecord:
 
 
 @dataclass(frozen=True)
-class Flight:
+class Flight(Keepable):
     """Some worlds flown by one policy.
 
     Attributes:
@@ -187,7 +189,7 @@ class Trace:
         self.position_error = np.where(self._going, largest, self.position_error)
 
 
-def shapes_of(policy: Policy, worlds: int, agents: int) -> list[tuple[int, ...]]:
+def shapes_of(policy: BasePolicy, worlds: int, agents: int) -> list[tuple[int, ...]]:
     """Return the shapes that the actions of a policy may have; the first has a row per agent."""
     rows = (worlds * agents, THRUSTERS)
     if not is_global(policy):
@@ -195,20 +197,22 @@ def shapes_of(policy: Policy, worlds: int, agents: int) -> list[tuple[int, ...]]
     return [rows, (worlds, agents, THRUSTERS), (worlds, agents * THRUSTERS)]
 
 
-def is_global(policy: Policy) -> bool:
+def is_global(policy: BasePolicy) -> bool:
     """Return whether the policy is fed `state()` of all worlds."""
-    return getattr(policy, "observes", "local") == "global"
+    return policy.observes == "global"
 
 
-def bare(policy: Policy) -> Policy:
-    """Return a policy without the safety filter that it wears, which has it as `policy`.
+def make_filter(policy: BasePolicy, env: Any, disturbance_bound: float) -> BasePolicy:
+    """Return a policy that uses the safety filter.
 
-    A policy of the user's own may call something else so, the model that it asks for instance: only
-    a filter has the name of what it filters.
+    Args:
+        policy: The policy.
+        env: An environment of spacecraft; its task and preset are taken.
+        disturbance_bound: d_bar, in units of the state per second.
     """
-    inner = getattr(policy, "policy", None)
-    worn = getattr(policy, "name", None) == f"{getattr(inner, 'name', None)}+filter"
-    return inner if worn and inner is not None else policy
+    from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
+
+    return SafetyFilter(policy, env.settings, env.preset, disturbance_bound=disturbance_bound)
 
 
 def fly(
@@ -239,23 +243,22 @@ def fly(
 
 
 def fly_chunk(
-    make_env: Any, policy: Policy, seeds: Sequence[int], margin: float | None = None
+    make_env: Any, policy: Any, seeds: Sequence[int], margin: float | None = None
 ) -> Flight:
     """Fly worlds in one batch, and one by one where that raises or the policy draws for itself.
 
     Args:
         make_env: Number of worlds to a `SpacecraftVectorEnv`.
-        policy: The policy.
+        policy: The policy, or an object with its `predict`.
         seeds: Seeds of the episodes.
         margin: As for `fly`.
 
     Returns:
         The records, in the order of the seeds, and the counters.
     """
-    from lagros_policies.policy import as_policy
-
+    policy = as_policy(policy)
     # What a policy draws comes from the stream of one episode.
-    alone = len(seeds) == 1 or as_policy(bare(policy)).draws
+    alone = len(seeds) == 1 or policy.draws
     if not alone:
         flight = fly(WorldsLoop(make_env(len(seeds)), policy), seeds, margin)
         if all(world.error is None for world in flight.worlds):

@@ -10,10 +10,10 @@ import numpy as np
 
 from lagros_benchmarks.run.episodes import added_up
 from lagros_benchmarks.run.experiment import BenchmarkRun
-from lagros_benchmarks.run.flying import check_interface
-from lagros_benchmarks.run.library import FloatArray, Policy, Toolbox, building, check_observes
+from lagros_benchmarks.run.library import FloatArray, Toolbox, building, built_policy
 from lagros_benchmarks.run.settings import BenchmarkSettings, Case
 from lagros_benchmarks.run.workers import Keeper, Progress
+from lagros_benchmarks.tasks.spacecraft.claims import position_margin
 from lagros_benchmarks.tasks.spacecraft.episodes import (
     Flight,
     Trace,
@@ -21,11 +21,12 @@ from lagros_benchmarks.tasks.spacecraft.episodes import (
     WorldsLoop,
     fly,
     fly_chunk,
-    is_global,
+    make_filter,
 )
 from lagros_benchmarks.tasks.spacecraft.timing import PLAN_WORLDS, Timing, time_plans, time_policy
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+from lagros_policies.policy import BasePolicy
 
 Value = TypeVar("Value")
 
@@ -127,7 +128,7 @@ class SpacecraftExperiment:
             autoreset_mode="disabled",
         )
 
-    def policy(self, case: Case, env: SpacecraftVectorEnv) -> Policy:
+    def policy(self, case: Case, env: SpacecraftVectorEnv) -> BasePolicy:
         """Build the policy of a case, with its filter.
 
         Raises:
@@ -135,14 +136,11 @@ class SpacecraftExperiment:
         """
         name, bound = case.policy, case.condition.bound
         given = self.settings.policy_settings.get(name, {})
-        with building(f"policy {name!r}"):
-            policy = self.toolbox.make_policy(name, env, given)
-        check_observes(f"policy {name!r}", policy)
+        policy = built_policy(name, lambda: self.toolbox.make_policy(name, env, given))
         if not case.safety_filter:
             return policy
-        check_interface(f"policy {name!r}", policy)
         with building(f"policy {name!r} with the safety filter"):
-            return self.toolbox.make_filter(policy, env, bound)
+            return (self.toolbox.make_filter or make_filter)(policy, env, bound)
 
     def units(self, progress: Progress | None, keeper: Keeper | None = None) -> list[int]:
         """Return the seed of every world: each policy plans for itself."""
@@ -151,7 +149,8 @@ class SpacecraftExperiment:
     def play(self, case: Case, units: Sequence[int]) -> Flight:
         """Fly a chunk of worlds."""
         policy = self.policy(case, self.environment(case, 1))
-        margin = self._margin(policy, case)
+        bound_of = self.toolbox.position_margin or position_margin
+        margin = bound_of(policy, case.condition.bound)
 
         def worlds(count: int) -> SpacecraftVectorEnv:
             return self.environment(case, count)
@@ -164,7 +163,7 @@ class SpacecraftExperiment:
         policy = self.policy(case, env)
         WorldsLoop(env, policy).rehearse(f"policy {case.policy!r}", [0])
         timing = time_policy(env, policy, units)
-        if not is_global(policy):
+        if policy.observes == "local":
             return [timing]
         further = self.settings.episode_seeds()[len(units) : PLAN_WORLDS]
         plans = np.concatenate([timing.plans, time_plans(env, policy, further)])
@@ -190,9 +189,6 @@ class SpacecraftExperiment:
                 for case, flights in outcomes.items()
             },
         )
-
-    def _margin(self, policy: Policy, case: Case) -> float | None:
-        return self.toolbox.position_margin(policy, case.condition.bound)
 
 
 def fly_scene(settings: BenchmarkSettings, world: int, toolbox: Toolbox) -> Scene:

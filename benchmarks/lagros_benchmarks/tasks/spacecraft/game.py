@@ -10,8 +10,8 @@ import numpy as np
 from lagros_benchmarks.report.video import Frame
 from lagros_benchmarks.report.watched import efforts
 from lagros_benchmarks.run import library
-from lagros_benchmarks.run.flying import Attempt, ask, check_interface, counted, rehearse, reseed
-from lagros_benchmarks.tasks.spacecraft.episodes import is_global, shapes_of
+from lagros_benchmarks.run.flying import Attempt, ask, counted, rehearse, reseed
+from lagros_benchmarks.tasks.spacecraft.episodes import is_global, make_filter, shapes_of
 from lagros_envs import spacecraft_v0
 from lagros_envs.tasks.spacecraft.draw import SpacecraftRenderer
 from lagros_envs.tasks.spacecraft.scenarios import Preset, Scenario, preset_named
@@ -137,9 +137,8 @@ class SpacecraftGame:
         policy: Any = library.make_single_policy(settings.policy, self.env)
         if not settings.safety_filter:
             return policy, policy
-        check_interface(name, policy)
         with library.building(f"{name} with the safety filter"):
-            return policy, library.make_filter(policy, self.env, settings.disturbance_bound)
+            return policy, make_filter(policy, self.env, settings.disturbance_bound)
 
     def _seen(self, policy: Any, env: Any, observations: dict[str, Any]) -> Any:
         if is_global(policy):

@@ -30,26 +30,19 @@ from lagros_benchmarks.tasks.spacecraft.timing import Timing
 BoolArray = NDArray[np.bool_]
 
 
-def rows(run: SpacecraftRun) -> list[Row]:
-    """Return one row per policy, filter, bound and number of agents; what it ran on is not in."""
-    return [
-        {
-            **_identity(run, case),
-            **_outcomes(worlds),
-            **_efforts(worlds),
-            **_times(run.timing[case], run.control_period),
-            **_tracking(worlds),
-            "counters": dict(run.counters[case]),
-            "raised": sum(world.error is not None for world in worlds),
-            "errors": [{"seed": w.seed, "text": w.error} for w in worlds if w.error is not None],
-            "versus": _versus(run, case),
-            "filter_effect": _filter_effect(run, case),
-        }
-        for case, worlds in run.episodes.items()
-    ]
+def figures(run: SpacecraftRun, case: Case) -> Row:
+    """Return the figures of a policy, filtered or not, under one bound and number of agents."""
+    worlds = run.episodes[case]
+    return {
+        **_outcomes(worlds),
+        **_efforts(worlds),
+        **_times(run.timing[case], run.control_period),
+        **_tracking(worlds),
+        "counters": dict(run.counters[case]),
+    }
 
 
-def agent_objects(run: SpacecraftRun) -> Iterable[dict[str, Any]]:
+def episode_objects(run: SpacecraftRun) -> Iterable[dict[str, Any]]:
     """Yield every agent of every world as an object."""
     for case, worlds in run.episodes.items():
         for world in worlds:
@@ -66,22 +59,6 @@ def agent_objects(run: SpacecraftRun) -> Iterable[dict[str, Any]]:
                     "planned": world.planned,
                     "error": world.error,
                 }
-
-
-def _identity(run: SpacecraftRun, case: Case) -> Row:
-    settings = run.settings
-    return {
-        "task": settings.task,
-        "policy": case.policy,
-        "disturbance": case.condition.kind,
-        "bound": case.condition.bound,
-        "channels": settings.channels,
-        "preset": settings.preset,
-        "agents": case.agents,
-        "episodes": settings.episodes,
-        "seed": settings.seed,
-        "safety_filter": case.safety_filter,
-    }
 
 
 def _flags(worlds: Sequence[WorldRecord], what: Callable[[AgentRecord], Any]) -> BoolArray:
@@ -183,24 +160,7 @@ def _tracking(worlds: Sequence[WorldRecord]) -> Row:
     }
 
 
-def _versus(run: SpacecraftRun, case: Case) -> dict[str, Row]:
-    """Compare with every other policy on the same agents, filtered alike."""
-    return {
-        name: _comparison(run.episodes[case], run.episodes[case._replace(policy=name)])
-        for name in run.settings.policies
-        if name != case.policy
-    }
-
-
-def _filter_effect(run: SpacecraftRun, case: Case) -> Row | None:
-    """Compare a policy that wears the filter with itself without, on the same agents."""
-    bare = case._replace(safety_filter=False)
-    if not case.safety_filter or bare not in run.episodes:
-        return None
-    return _comparison(run.episodes[case], run.episodes[bare])
-
-
-def _comparison(ours: Sequence[WorldRecord], theirs: Sequence[WorldRecord]) -> Row:
+def comparison(ours: Sequence[WorldRecord], theirs: Sequence[WorldRecord]) -> Row:
     """Return the difference in success and the ratio of efforts of the agents that both solve."""
     mine = _flags(ours, lambda agent: agent.success)
     other = _flags(theirs, lambda agent: agent.success)

@@ -105,6 +105,11 @@ class SpacecraftReproduceSettings:
     backend: Backend = LOKY
     free: ClassVar[tuple[str, ...]] = ("jobs", "backend", "worlds", "seed", "bounds")
 
+    @classmethod
+    def for_task(cls, task: str, episodes: int | None, **asked: Any) -> SpacecraftReproduceSettings:
+        """Return the settings of a run; see `run.reproduction.Reproduction`."""
+        return cls(**asked | ({} if episodes is None else {"worlds": episodes}))
+
     def __post_init__(self) -> None:
         """Check, before hours of work, what the benchmark at their end will ask."""
         check_fields(self)

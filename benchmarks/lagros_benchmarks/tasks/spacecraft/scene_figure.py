@@ -17,8 +17,10 @@ from lagros_benchmarks.report.canvas import (
 )
 from lagros_benchmarks.report.canvas import save as write
 from lagros_benchmarks.report.formats import policy_label
+from lagros_benchmarks.run.library import Toolbox
+from lagros_benchmarks.run.settings import BenchmarkSettings
 from lagros_benchmarks.tasks.spacecraft.episodes import AgentRecord
-from lagros_benchmarks.tasks.spacecraft.experiment import Scene, ScenePanel
+from lagros_benchmarks.tasks.spacecraft.experiment import Scene, ScenePanel, fly_scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,6 +31,11 @@ _OBSTACLE, _OBSTACLE_RIM, _RED = "#C9C9C9", "#8C8C8C", "#B00020"
 _BORDER = 0.6  # of the view around the arena and all goals [m]
 _DISC_EVERY = 5.0  # time between the discs along a path [s]
 _MOST_COLUMNS = 4
+
+
+def draw_scene(settings: BenchmarkSettings, world: int, path: str | Path) -> Path:
+    """Fly one world of a run again with every policy, and draw it; see `fly_scene`."""
+    return scene_figure(fly_scene(settings, world, Toolbox()), path)
 
 
 def scene_figure(scene: Scene, path: str | Path) -> Path:

@@ -24,7 +24,7 @@ from lagros_benchmarks.report.formats import (
 )
 from lagros_benchmarks.run.experiment import Row
 
-LEGEND = (
+_LEGEND = (
     "Rates are per agent. Success: within 0.2 m of the goal before 45 s and any collision, with a "
     "95 % interval over worlds; strict: there at the end, never collided; paper: inside the "
     "paper's tube around the goal; coll.: collided, ever. ∫‖u‖²: mean effort of an agent to "
@@ -56,7 +56,7 @@ def _effort(row: Row) -> str:
 
 
 # Heading (two lines) and content of each column of the terminal and LaTeX tables.
-COLUMNS: tuple[Column, ...] = (
+_COLUMNS: tuple[Column, ...] = (
     ("policy", "", lambda row: _label(row) + mark(row)),
     ("success", "%", lambda row: with_interval(row["success_rate"], row["success_world_ci95"])),
     ("strict", "%", lambda row: percent(row["strict_success_rate"])),
@@ -66,6 +66,20 @@ COLUMNS: tuple[Column, ...] = (
     ("Δt ms", "p50", lambda row: milliseconds(plan_or_step(row, "median"))),
     ("Δt ms", "p99", lambda row: milliseconds(plan_or_step(row, "p99"))),
 )
+
+
+# The widest figures of eight columns leave no room for a frame.
+FRAMED = False
+
+
+def legend(row: Row) -> str:
+    """Return what the columns mean."""
+    return _LEGEND
+
+
+def columns(row: Row) -> tuple[Column, ...]:
+    """Return the columns, which are the same for every row."""
+    return _COLUMNS
 
 
 def title(row: Row) -> str:
@@ -213,8 +227,8 @@ def markdown_grids(groups: Sequence[Sequence[Row]]) -> list[str]:
         blocks += [name.replace("\n", ": "), markdown_table(headings, _trimmed(contents))]
     swept = [row for series in _series(rows) for row in series]
     for group in (group for group in groups if group[0] not in swept):
-        headings = [f"{heading} [{unit}]" if unit else heading for heading, unit, _ in COLUMNS]
-        lines = [[content(row) for _, _, content in COLUMNS] for row in ordered(group)]
+        headings = [f"{heading} [{unit}]" if unit else heading for heading, unit, _ in _COLUMNS]
+        lines = [[content(row) for _, _, content in _COLUMNS] for row in ordered(group)]
         blocks += [condition_title(group[0]), markdown_table(headings, _trimmed(lines))]
     return blocks
 

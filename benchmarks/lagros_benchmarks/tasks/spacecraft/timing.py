@@ -9,17 +9,19 @@ from typing import Any
 import numpy as np
 
 from lagros_benchmarks.run.flying import Attempt, ask
-from lagros_benchmarks.run.library import FloatArray, Policy
+from lagros_benchmarks.run.keeping import Keepable
+from lagros_benchmarks.run.library import FloatArray
 from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, is_global
 from lagros_envs.tasks.spacecraft.task import THRUSTERS
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+from lagros_policies.policy import BasePolicy
 
 # A joint plan is made once a world, so that the few worlds of the pass would time too few plans.
 PLAN_WORLDS = 50
 
 
 @dataclass(frozen=True)
-class Timing:
+class Timing(Keepable):
     """Times of calls of `predict`, with the conversion of their results [s].
 
     Attributes:
@@ -38,7 +40,7 @@ class Timing:
     raised: int
 
 
-def time_policy(env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int]) -> Timing:
+def time_policy(env: SpacecraftVectorEnv, policy: BasePolicy, seeds: Sequence[int]) -> Timing:
     """Fly the episodes again for the times of the calls.
 
     A local policy is called twice at every step: for all agents of the world, which flies it, and
@@ -73,7 +75,7 @@ def time_policy(env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int]) 
     return Timing(np.array(steps), np.array(batches), np.array(plans), env.num_agents, raised)
 
 
-def time_plans(env: SpacecraftVectorEnv, policy: Policy, seeds: Sequence[int]) -> FloatArray:
+def time_plans(env: SpacecraftVectorEnv, policy: BasePolicy, seeds: Sequence[int]) -> FloatArray:
     """Return the times of the first calls alone [s], of a policy for all agents together."""
     loop = WorldsLoop(env, policy)
     times: list[float] = []

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.run.flying import Attempt
-from lagros_benchmarks.run.library import Policy
-from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, bare, is_global
+from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop
 from lagros_envs.disturbances import Situation, onto_unit_sphere
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+from lagros_policies.policy import BasePolicy
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -145,7 +145,7 @@ class SpacecraftTarget:
         ValueError: The goal is unknown, or "tube" of a policy without a certified margin.
     """
 
-    policy: Policy
+    policy: BasePolicy
     seed: int
     agents: int
     preset: str
@@ -311,11 +311,11 @@ class PlansOnce:
         return self._known[key]
 
 
-def remember_plans(policy: Policy) -> None:
+def remember_plans(policy: BasePolicy) -> None:
     """Let the joint planner of a policy, if it has one, plan each scenario once."""
-    inner: Any = bare(policy)
+    inner: Any = policy.bare
     planner = getattr(inner, "planner", None)
-    if planner is not None and is_global(inner) and not isinstance(planner, PlansOnce):
+    if planner is not None and inner.observes == "global" and not isinstance(planner, PlansOnce):
         inner.planner = PlansOnce(planner)
 
 

@@ -1,4 +1,4 @@
-"""What the tables of the cart-pole say."""
+"""What the tables of a task of one body say."""
 
 from __future__ import annotations
 
@@ -22,24 +22,60 @@ from lagros_benchmarks.run.experiment import Row
 
 _REFERENCES = ("tube-mpc", "lagros")
 
-LEGEND = (
+_LEGEND = (
     "Success and strict success (inside the tube at the time limit, never fell) with 95 % "
     "intervals; effort: mean integral of u² to success, else to the end; Δt: time of one call of "
     "predict; left tube: episodes that fell, have no plan, or whose error x - x_d ever left the "
     "paper's tube."
 )
-
-
-# Heading (two lines) and content of each column of the terminal and LaTeX tables.
-COLUMNS: tuple[Column, ...] = (
-    ("policy", "", row_label),
-    ("success", "%", lambda row: with_interval(row["success_rate"], row["success_ci95"])),
-    ("strict", "%", lambda row: percent(row["strict_success_rate"])),
-    ("effort", "N²s", lambda row: number(row["effort_mean"])),
-    ("Δt ms", "median", lambda row: milliseconds(row["step_time_median_s"])),
-    ("Δt ms", "p99", lambda row: milliseconds(row["step_time_p99_s"])),
-    ("left", "tube %", lambda row: percent(row["tube_violation_rate"])),
+# Of a task without a published tube.
+_PLAIN_LEGEND = (
+    "Success (at the goal before the limit, a collision or a fall) and strict success (there at "
+    "the end) with 95 % intervals; coll.: touched a disc; fell: left what the task allows; effort: "
+    "mean integral of ‖u − centre‖² to success, else to the end; Δt: time of one call of predict."
 )
+FRAMED = True
+
+
+def legend(row: Row) -> str:
+    """Return what the columns mean."""
+    return _LEGEND if _has_tube(row) else _PLAIN_LEGEND
+
+
+def columns(row: Row) -> tuple[Column, ...]:
+    """Return heading (two lines) and content of each column of the terminal and LaTeX tables."""
+    effort = (row.get("units") or {"effort": "N²s"})["effort"]
+    begin: tuple[Column, ...] = (
+        ("policy", "", row_label),
+        ("success", "%", lambda row: with_interval(row["success_rate"], row["success_ci95"])),
+        ("strict", "%", lambda row: percent(row["strict_success_rate"])),
+    )
+    middle: tuple[Column, ...] = (
+        ("effort", effort, lambda row: number(row["effort_mean"])),
+        ("Δt ms", "median", lambda row: milliseconds(row["step_time_median_s"])),
+        ("Δt ms", "p99", lambda row: milliseconds(row["step_time_p99_s"])),
+    )
+    if _has_tube(row):
+        return (
+            *begin,
+            *middle,
+            ("left", "tube %", lambda row: percent(row["tube_violation_rate"])),
+        )
+    return (
+        *begin,
+        ("coll.", "%", lambda row: percent(row["collision_rate"])),
+        ("fell", "%", lambda row: percent(row["fall_rate"])),
+        *middle,
+    )
+
+
+def _has_tube(row: Row) -> bool:
+    return row["paper_tube"] is not None
+
+
+def sweeps(rows: Sequence[Row]) -> Iterator[tuple[str, list[str], list[list[str]]]]:
+    """Yield the tables of several conditions side by side: none, the grid of Markdown apart."""
+    yield from ()
 
 
 def title(row: Row) -> str:

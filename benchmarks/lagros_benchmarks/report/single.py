@@ -1,4 +1,4 @@
-"""From cart-pole episodes to the rows of a published table."""
+"""From episodes of one body to the rows of a published table."""
 
 from __future__ import annotations
 
@@ -20,30 +20,26 @@ from lagros_benchmarks.run.metrics import (
     wilson_interval,
 )
 from lagros_benchmarks.run.settings import Case
-from lagros_benchmarks.tasks.cartpole.experiment import CartPoleRun
+from lagros_benchmarks.run.single import SingleRun
+from lagros_envs.task import Task
 
 _BAND = (10.0, 90.0)  # percentiles of the tracking error over the episodes
 
 
-def rows(run: CartPoleRun) -> list[Row]:
-    """Return one row per policy and condition, without what the run ran on."""
-    return [
-        {
-            **_identity(run, case),
-            **_outcomes(records),
-            **_efforts(records),
-            **_times(run, case),
-            **_tracking(run, case),
-            "counters": added_up({**r.counters, **r.timed_counters} for r in records),
-            "raised": sum(record.error is not None for record in records),
-            "errors": [{"seed": r.seed, "text": r.error} for r in records if r.error is not None],
-            "versus": _versus(run, case),
-        }
-        for case, records in run.episodes.items()
-    ]
+def figures(run: SingleRun, case: Case) -> Row:
+    """Return the figures of a policy under one condition."""
+    records = run.episodes[case]
+    return {
+        **_outcomes(records),
+        **_efforts(records),
+        **_times(run, case),
+        **_tracking(run, case),
+        "units": _units(run.task),
+        "counters": added_up({**r.counters, **r.timed_counters} for r in records),
+    }
 
 
-def episode_objects(run: CartPoleRun) -> Iterable[dict[str, Any]]:
+def episode_objects(run: SingleRun) -> Iterable[dict[str, Any]]:
     """Yield every episode as an object, without the time of each step."""
     for records in run.episodes.values():
         for record in records:
@@ -53,17 +49,14 @@ def episode_objects(run: CartPoleRun) -> Iterable[dict[str, Any]]:
             yield {**fields, "step_time_median_s": times.median, "step_time_max_s": times.maximum}
 
 
-def _identity(run: CartPoleRun, case: Case) -> Row:
-    settings = run.settings
+def _units(task: Task) -> Row:
+    """Return the units of the effort and of the state; "" where there is none."""
+    states = [name.partition("[")[2].rstrip("]") for name in task.state_names]
+    control = task.control_unit
+    squared = f"({control})²s" if len(control) > 1 else f"{control}²s"
     return {
-        "task": settings.task,
-        "policy": case.policy,
-        "disturbance": case.condition.kind,
-        "bound": case.condition.bound,
-        "channels": settings.channels,
-        "episodes": settings.episodes,
-        "seed": settings.seed,
-        "safety_filter": False,
+        "effort": squared if control else "",
+        "state": ", ".join(states) if all(states) else "",
     }
 
 
@@ -78,8 +71,7 @@ def _outcomes(records: Sequence[EpisodeRecord]) -> Row:
         "strict_success_rate": strict / count,
         "strict_success_ci95": wilson_interval(strict, count),
         "fall_rate": sum(record.fallen for record in records) / count,
-        # Nothing to collide with on the cart's track.
-        "collision_rate": 0.0,
+        "collision_rate": sum(record.collided for record in records) / count,
         "success_time_median_s": float(np.median(times)) if times else None,
     }
 
@@ -95,7 +87,7 @@ def _efforts(records: Sequence[EpisodeRecord]) -> Row:
     }
 
 
-def _times(run: CartPoleRun, case: Case) -> Row:
+def _times(run: SingleRun, case: Case) -> Row:
     timed = run.timing[case]
     alone = _step_times(timed)
     contended = None if run.timing is run.episodes else _step_times(run.episodes[case])
@@ -124,36 +116,35 @@ def _step_times(records: Sequence[EpisodeRecord]) -> Row:
     }
 
 
-def _tracking(run: CartPoleRun, case: Case) -> Row:
-    records = run.episodes[case]
+def _tracking(run: SingleRun, case: Case) -> Row:
+    records, tube = run.episodes[case], run.paper_tube
+    left = [record.left_paper_tube for record in records if record.left_paper_tube is not None]
+    measured = [r.tracking_error for r in records if r.max_tracking_error is not None]
     row: Row = {
-        "tube_violation_rate": sum(bool(record.left_paper_tube) for record in records)
-        / len(records),
+        "tube_violation_rate": sum(left) / len(left) if left else None,
         # No certified tube of ours is about these flights: see `claims`.
         "certified_violation_rate": None,
         "plans_failed": sum(plan.states is None for plan in run.plans),
         "time_s": _rounded(run.times),
-        "paper_tube": _rounded(run.paper_tube),
+        "paper_tube": None if tube is None else _rounded(tube),
         "certified_tube": None,
+        "tracking_episodes": len(measured),
+        "tracking_error_mean_below_tube": None if tube is None else False,
+        "mean_tracking_error": None,
+        "tracking_error_p10": None,
+        "tracking_error_p90": None,
     }
-    measured = [r.tracking_error for r in records if r.max_tracking_error is not None]
-    row["tracking_episodes"] = len(measured)
     if not measured:
-        return {
-            **row,
-            "tracking_error_mean_below_tube": False,
-            "mean_tracking_error": None,
-            "tracking_error_p10": None,
-            "tracking_error_p90": None,
-        }
+        return row
     curves = carry_forward(np.array(measured))
     mean = curves.mean(axis=0)
     low, high = np.percentile(curves, _BAND, axis=0, method="nearest")
-    raised = any(record.error is not None for record in records)
-    below = not raised and bool(np.all(mean <= run.paper_tube + TUBE_TOLERANCE))
+    if tube is not None:
+        raised = any(record.error is not None for record in records)
+        below = not raised and bool(np.all(mean <= tube + TUBE_TOLERANCE))
+        row["tracking_error_mean_below_tube"] = below
     return {
         **row,
-        "tracking_error_mean_below_tube": below,
         "mean_tracking_error": _rounded(mean),
         "tracking_error_p10": _rounded(low),
         "tracking_error_p90": _rounded(high),
@@ -165,25 +156,17 @@ def _rounded(curve: FloatArray) -> list[float]:
     return [round(float(value), 6) for value in curve]
 
 
-def _versus(run: CartPoleRun, case: Case) -> dict[str, Row]:
-    """Compare with every other policy on the same episodes."""
-    ours = run.episodes[case]
-    solved = [record.success for record in ours]
-    comparisons: dict[str, Row] = {}
-    for name in run.settings.policies:
-        if name == case.policy:
-            continue
-        theirs = run.episodes[Case(name, case.condition)]
-        their_solved = [record.success for record in theirs]
-        success = paired_success_difference(solved, their_solved)
-        effort = effort_ratio(
-            [r.effort for r in ours], solved, [r.effort for r in theirs], their_solved
-        )
-        comparisons[name] = {
-            "success_difference": success.difference,
-            "success_difference_ci95": success.interval,
-            "effort_ratio": None if effort is None else effort.ratio,
-            "effort_ratio_ci95": None if effort is None else effort.interval,
-            "episodes_both_solve": 0 if effort is None else effort.episodes,
-        }
-    return comparisons
+def comparison(ours: Sequence[EpisodeRecord], theirs: Sequence[EpisodeRecord]) -> Row:
+    """Compare a policy with another on the same episodes."""
+    solved, their_solved = ([record.success for record in one] for one in (ours, theirs))
+    success = paired_success_difference(solved, their_solved)
+    effort = effort_ratio(
+        [r.effort for r in ours], solved, [r.effort for r in theirs], their_solved
+    )
+    return {
+        "success_difference": success.difference,
+        "success_difference_ci95": success.interval,
+        "effort_ratio": None if effort is None else effort.ratio,
+        "effort_ratio_ci95": None if effort is None else effort.interval,
+        "episodes_both_solve": 0 if effort is None else effort.episodes,
+    }
