@@ -171,15 +171,8 @@ class CentralizedPolicy(BasePolicy):
     ) -> tuple[Float32Array, PolicyState]:
         """Plan at the start, then track; see `Policy.predict`.
 
-        Args:
-            observation: `state()` of one world (s,), or of a batch of worlds (B, s).
-            state: What the last call returned: one `CentralizedState` per world.
-            episode_start: Which worlds start an episode, shape (B,).
-            deterministic: Has no effect: nothing here is random.
-
-        Returns:
-            The actions of all agents in the environment's order, (agents, 8) or (B, agents, 8), and
-            the memories.
+        Rows are worlds, `state()` of one (s,) or of many (B, s), with a `CentralizedState` each;
+        actions are those of all agents in the environment's order, (agents, 8) or (B, agents, 8).
 
         Raises:
             ValueError: The observation is not a `state()` of this task, or the memories are not

@@ -163,14 +163,7 @@ class DistributedTubeMpcPolicy(BasePolicy):
     ) -> tuple[Float32Array, PolicyState]:
         """Plan if it is time, and track; see `Policy.predict`.
 
-        Args:
-            observation: o_l of one agent (o,), or of any number of agents (B, o).
-            state: What the last call returned: one `DistributedState` per row.
-            episode_start: Which rows start an episode, shape (B,).
-            deterministic: Has no effect: nothing here is random.
-
-        Returns:
-            The actions, (8,) or (B, 8), and the memories.
+        Rows are agents, o_l of one (o,) or of many (B, o), with a `DistributedState` each.
 
         Raises:
             ValueError: The observation is not that of an agent of this task, or the memories are

@@ -174,20 +174,7 @@ class SpacecraftPpoPolicy(SpacecraftActor):
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
-        """Choose the thrusts; see `Policy.predict`.
-
-        Args:
-            observation: Of one agent (o,), or of many (B, o).
-            state: Is passed on: the actor remembers nothing.
-            episode_start: Has no effect.
-            deterministic: Has no effect: this is the mean action.
-
-        Returns:
-            The actions (8,) or (B, 8) within [0, 1], and the state.
-
-        Raises:
-            ValueError: The observation is not of this task.
-        """
+        """Choose the mean thrusts of one agent (o,) or of many (B, o); see `Policy.predict`."""
         seen = look(self.layout, observation)
         thrust = thrust_of(self.settings, seen.axes, self.network(seen.features))
         return (thrust if np.ndim(observation) == 2 else thrust[0]), state

@@ -119,15 +119,7 @@ class SafetyFilter(BasePolicy):
     ) -> tuple[Float32Array, PolicyState]:
         """Ask the inner policy and filter its actions; see `Policy.predict`.
 
-        Args:
-            observation: As the inner policy takes it: rows of agents, (B, o) or (o,), or rows of
-                `state()`, (B, s) or (s,).
-            state: What the last call returned.
-            episode_start: Which rows start an episode, shape (B,).
-            deterministic: Passed on.
-
-        Returns:
-            The actions, of the shape of the inner policy's, and the state.
+        Rows are what the inner policy takes, agents or worlds, and so are the actions.
 
         Raises:
             ValueError: The observation, the state or the inner action has a wrong shape, or is not
