@@ -12,7 +12,7 @@ import pytest
 from lagros_envs import spacecraft_v0
 from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Scenario
 from lagros_envs.tasks.spacecraft.sensing import Layout
-from lagros_policies.learning.deep_set import DeepSet, pool
+from lagros_policies.learning.deep_set import DeepSet, Elements, SetFeatures, pool
 from lagros_policies.tasks.spacecraft.features import NEIGHBOUR, OBSTACLE, OWN
 from lagros_policies.tasks.spacecraft.network_policy import SpacecraftNetworkPolicy
 from lagros_policies.tasks.spacecraft.sensed import Sensed
@@ -242,3 +242,37 @@ def test_a_network_of_other_features_or_answers_is_refused(tmp_path, own, output
     text = rf"other\.safetensors maps .* to {outputs}; .*lagros reproduce"
     with pytest.raises(ValueError, match=text):
         SpacecraftNetworkPolicy(weights=path)
+
+
+def test_a_set_of_any_features_is_the_sum_over_its_elements():
+    rng = np.random.default_rng(4)
+    parts = (3, 6, 5), (2, 4), (2 + 5 + 4, 7, 6)
+    network = DeepSet(*(random_layers(rng, *widths) for widths in parts))
+    assert (network.inputs, network.outputs) == ((2, 3, 2), 6)
+    own = rng.normal(size=(3, 2)).astype(np.float32)
+    owners = np.array([0, 0, 2]), np.array([1])
+    elements = [
+        Elements(
+            rng.normal(size=(len(owner), width)).astype(np.float32),
+            owner,
+            rng.random(len(owner), dtype=np.float32),
+        )
+        for owner, width in zip(owners, (3, 2), strict=True)
+    ]
+    answers = network(SetFeatures(own, *elements, np.ones(3, complex)))
+
+    def through(layers, value, last=False):
+        for index, (weight, bias) in enumerate(layers):
+            value = value @ weight + bias
+            value = value if last and index == len(layers) - 1 else np.maximum(value, 0.0)
+        return value
+
+    for agent in range(3):
+        inputs = [own[agent]]
+        for name, width, of_kind in zip(("neighbour", "obstacle"), (5, 4), elements, strict=True):
+            total = np.zeros(width)
+            for value, owner, weight in zip(*of_kind, strict=True):
+                total += weight * through(network.layers[name], value) * (owner == agent)
+            inputs.append(total)
+        wanted = through(network.layers["agent"], np.concatenate(inputs), last=True)
+        np.testing.assert_allclose(answers[agent], wanted, rtol=1e-5, atol=1e-6)
