@@ -44,11 +44,11 @@ class CarTask(Task):
     position, body_radius, margin, most_discs = (0, 1), 0.2, 0.25, 5
     # The controls turn all that the motion depends on: a metric of x_d.
     metric = MetricDesign(
-        low=(-20.0, -20.0, -math.pi, 0.5),
-        high=(20.0, 20.0, math.pi, 2.5),
+        low=(-5.0, -5.0, -math.pi, 0.5),
+        high=(15.0, 5.0, math.pi, 2.5),
         error=(0.5, 0.5, 0.5, 0.5),
-        control_low=(-2.0, -1.0),
-        control_high=(2.0, 1.0),
+        control_low=(-3.0, -1.0),
+        control_high=(3.0, 1.0),
         basis=tuple(
             angle if power == "1" else power if angle == "1" else f"{angle}*{power}"
             for angle in ("1", "cos(x[2])", "sin(x[2])", "cos(x[2])^2", "cos(x[2])*sin(x[2])")
@@ -57,7 +57,7 @@ class CarTask(Task):
         point="nominal",
     )
     feedback = Feedback((1.0, 1.0, 0.3, 0.3), (1.0, 1.0))
-    learning = Learning(plans=2000, disturbance_bound=0.5, hidden=(128, 128, 128), rounds=4)
+    learning = Learning(2000, 120_000, 0.4, (64, 64, 128, 128), 30, 30, 3, 2000, 40_000, 12)
     defaults = Defaults(bounds=(0.4,), bound=0.4)
     weights = Path(__file__).parent / "car"
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -167,19 +167,26 @@ class Learning:
         plans: Random episodes with a target trajectory each.
         samples: Labelled states around them.
         disturbance_bound: Largest d_bar of the flights that fill the tube.
-        hidden: Width of each hidden layer of (c) and (a).
-        epochs: Passes over the data.
+        hidden: Width of each hidden layer of (c) and (a); where there are discs, the first two are
+            for each of them.
+        epochs: Passes over the data for (c).
+        learned_epochs: Likewise for (a).
         rounds: Rounds of DAgger: the network flies, u* says what it should have done.
         round_plans: Episodes of each round.
+        round_samples: Labelled states of each round.
+        round_epochs: Passes over the data before each round.
     """
 
     plans: int = 1000
-    samples: int = 100_000
+    samples: int = 50_000
     disturbance_bound: float = 1.0
-    hidden: tuple[int, ...] = (128, 128)
-    epochs: int = 100
+    hidden: tuple[int, ...] = (100, 100, 100)
+    epochs: int = 600
+    learned_epochs: int = 150
     rounds: int = 0
-    round_plans: int = 500
+    round_plans: int = 1000
+    round_samples: int = 50_000
+    round_epochs: int = 20
 
 
 @dataclass(frozen=True)
@@ -271,6 +278,8 @@ class Task(Described):
         feedback: What u* prefers, and the weights of the regulators; None for Bryson's rule.
         learning: How its networks are made; None for none.
         weights: Folder of its metric and networks; None for those of the package.
+        features: What its networks see, a method of an observation's components and the functions
+            that they may use, written like an equation of motion; None for the usual.
     """
 
     system: System
@@ -294,6 +303,7 @@ class Task(Described):
     feedback: ClassVar[Feedback | None] = None
     learning: ClassVar[Learning | None] = None
     weights: ClassVar[Path | None] = None
+    features: ClassVar[Callable[..., Sequence[Any]] | None] = None
     # Without an annotation: a task may make fields of them.
     alive_bonus = 10.0
     distance_weight = 1.0

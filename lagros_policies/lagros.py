@@ -9,4 +9,3 @@ class LagrosPolicy(NetworkPolicy):
     """(x, o_l, t) -> u*: planner and tracking control in one evaluation."""
 
     name = recorded_as = "lagros"
-    weights_file = "cartpole_lagros.safetensors"

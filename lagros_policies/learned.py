@@ -9,4 +9,3 @@ class LearnedPolicy(NetworkPolicy):
     """(x, o_l, t) -> u_d, trained on the target trajectories alone (Lemma 1)."""
 
     name = recorded_as = "learned"
-    weights_file = "cartpole_learned.safetensors"

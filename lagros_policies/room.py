@@ -10,6 +10,8 @@ module:attribute:
     WEIGHTS     weights of a regulator, of a task (`baselines.bryson_weights`)
     SPACES      shapes and bounds of its observations and actions (`sb3_model.single_spaces`)
     TRAINED     what its networks may fly, of a task (`trained_for.Training`)
+    VIEW        what its networks see, of a task (`learning.features.Usual`)
+    METRIC      how its metric is made (`learning.metric.MetricSettings`)
 
 and the function `told(world, settings)`, what its policies are built with besides the task.
 """

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 import lagros_envs  # noqa: F401  (registers the environment)
 from lagros_envs.seeding import episode_seeds
 from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.learning.features import seen
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.room import PRETRAINED
-from lagros_policies.tasks.cartpole.features import FEATURES, cartpole_features
+from lagros_policies.tasks.cartpole.features import CartPoleView
 from lagros_policies.tube_mpc import TubeMpcPolicy
 from speed.report import Section, Target, absent_row, timed_row
 from speed.timing import Candidate, Scale, Times, interleave
@@ -41,7 +42,7 @@ def sections(scale: Scale) -> list[Section]:
 
 def _random_network() -> Mlp:
     rng = np.random.default_rng(_SEED)
-    widths = [len(FEATURES), *_HIDDEN, 1]
+    widths = [len(CartPoleView.names), *_HIDDEN, 1]
     shapes = list(itertools.pairwise(widths))
     weights = [rng.standard_normal(shape) / np.sqrt(shape[0]) for shape in shapes]
     return Mlp(weights, [0.1 * rng.standard_normal(shape[1]) for shape in shapes])
@@ -65,7 +66,7 @@ def _forward(scale: Scale) -> Section:
     if not onnx:
         rows.append(absent_row("ONNX Runtime", "onnxruntime"))
     return Section(
-        f"Bare network {len(FEATURES)}-{'-'.join(map(str, _HIDDEN))}-1, batch 1",
+        f"Bare network {len(CartPoleView.names)}-{'-'.join(map(str, _HIDDEN))}-1, batch 1",
         rows,
         [Target("bare forward", 1e6 * reference.median, 25.0, "µs")],
         ["From a NumPy vector to a NumPy vector; all agree to 1e-5."],
@@ -116,10 +117,11 @@ def _predict(scale: Scale) -> Section:
     env = gym.make("lagros/CartPole-v0", **_DISTURBANCE)
     observation, _ = env.reset(seed=_SEED)
     policy, source = shipped_policy()
-    features, _ = cartpole_features(observation)
+    see = CartPoleView()
+    features, _ = seen(see, observation)
     candidates: dict[str, Candidate] = {
         "LagrosPolicy.predict": lambda _: policy.predict(observation),
-        "of this: features": lambda _: cartpole_features(observation),
+        "of this: features": lambda _: seen(see, observation),
         "of this: network": lambda _: policy.network(features),
     }
     sb3 = importlib.util.find_spec("stable_baselines3") is not None

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lagros_envs.checks import shown
 from lagros_policies.learning.networks import read_safetensors, write_safetensors
@@ -65,11 +66,9 @@ def load_progress(
 
     if not path.exists():
         return 0
-    tensors, metadata = read_safetensors(path)
+    tensors, metadata = _read(path, parameters)
     if metadata.get("fingerprint") != fingerprint:
         raise ValueError(f"{path} belongs to other settings or data; remove it to start anew")
-    if _shapes(parameters) != {name: tensor.shape for name, tensor in tensors.items()}:
-        raise ValueError(f"{path} holds another network; remove it to start anew")
     epoch = metadata.get("epoch", "")
     if not epoch.isdecimal():
         raise ValueError(f"{path} is damaged: epoch={shown(epoch)}; remove it to start anew")
@@ -82,6 +81,30 @@ def load_progress(
                 "exp_avg_sq": torch.from_numpy(tensors[f"{index}.square"].copy()),
             }
     return int(epoch)
+
+
+def load_values(path: Path, parameters: Sequence[torch.nn.Parameter]) -> None:
+    """Take over what a run that ended has learned, and nothing else of it.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The checkpoint is damaged, or of another network.
+    """
+    import torch
+
+    tensors, _ = _read(path, parameters)
+    with torch.no_grad():
+        for index, parameter in enumerate(parameters):
+            parameter.copy_(torch.from_numpy(tensors[f"{index}.value"]))
+
+
+def _read(
+    path: Path, parameters: Sequence[torch.nn.Parameter]
+) -> tuple[dict[str, NDArray[np.float32]], dict[str, str]]:
+    tensors, metadata = read_safetensors(path)
+    if _shapes(parameters) != {name: tensor.shape for name, tensor in tensors.items()}:
+        raise ValueError(f"{path} holds another network; remove it to start anew")
+    return tensors, metadata
 
 
 def _shapes(parameters: Sequence[torch.nn.Parameter]) -> dict[str, tuple[int, ...]]:

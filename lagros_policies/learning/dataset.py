@@ -1,13 +1,15 @@
 """Algorithm 1: random episodes, target trajectories, states in their tubes, labels u*.
 
-The work is cut into shards that depend on nothing but the settings and their index; see `shards`.
+Then DAgger: a network flies episodes, and what u* would have done is asked where it came to, around
+a plan from there. Both are data of one kind. The work is cut into shards that depend on nothing but
+the settings, the network and their index; see `shards`.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,12 +27,16 @@ from lagros_envs.checks import (
 from lagros_envs.disturbances import OPEN_LOOP, into_unit_ball
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
-from lagros_envs.tasks.cartpole import task
+from lagros_envs.task import Scenario, Task
 from lagros_policies.backends import LOKY, Backend
 from lagros_policies.contraction import Metric
 from lagros_policies.contraction.metric_files import region_record
+from lagros_policies.expert import Expert, TrackedPlans
+from lagros_policies.learning.networks import Mlp
+from lagros_policies.learning.rounds import met_states, padded_discs
 from lagros_policies.learning.shards import Shard, make_shards
-from lagros_policies.tasks.cartpole.expert import CartPoleExpert, TrackedPlans
+from lagros_policies.planning import Trajectory
+from lagros_policies.room import task_of
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -84,11 +90,14 @@ class ExpertData:
     """Labelled states and the plans they lie around.
 
     Attributes:
-        observation: What the policy sees at the state, shape (s, 13).
-        control: u*, shape (s, 1) [N].
+        observation: What the policy sees at the state, shape (s, o).
+        control: u*, shape (s, m).
         plan: Which plan each sample belongs to, shape (s,).
-        plan_states: x_d, shape (p, N + 1, 4).
-        plan_controls: u_d, shape (p, N, 1) [N].
+        plan_states: x_d, shape (p, N + 1, n); before the plan begins, where it begins.
+        plan_controls: u_d, shape (p, N, m).
+        plan_steps: Control step at which each plan begins, shape (p,).
+        plan_starts: x(0) of its episode, shape (p, n).
+        plan_discs: Discs of its episode, shape (p, most discs, 3).
         drawn: States drawn in all, with those outside the verified region.
     """
 
@@ -97,26 +106,38 @@ class ExpertData:
     plan: IntArray
     plan_states: FloatArray
     plan_controls: FloatArray
+    plan_steps: IntArray
+    plan_starts: FloatArray
+    plan_discs: FloatArray
     drawn: int
 
-    def nominal_pairs(self, settings: task.CartPoleSettings) -> tuple[FloatArray, FloatArray]:
-        """Return the observations along the plans, (p N, 13), and u_d, (p N, 1): data of (a)."""
-        steps = np.tile(np.arange(settings.steps), len(self.plan_states))
-        plan = np.repeat(np.arange(len(self.plan_states)), settings.steps)
-        states = self.plan_states[plan, steps]
-        observation = observations(states, self.plan_states[plan], steps, settings)
-        return observation, self.plan_controls[plan, steps]
+    def nominal_pairs(self, task: Task) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Return the observations along the plans, u_d there, and which plan: data of (a)."""
+        plan, step = np.nonzero(np.arange(task.steps) >= self.plan_steps[:, None])
+        seen = observations(task, self.plan_states[plan, step], step, plan, vars(self))
+        return seen, self.plan_controls[plan, step], plan
 
 
 def observations(
-    states: FloatArray, plans: FloatArray, steps: IntArray, settings: task.CartPoleSettings
+    task: Task, states: FloatArray, steps: IntArray, plan: IntArray, plans: dict[str, Any]
 ) -> FloatArray:
-    """Return what the environment shows at states (s, 4) of episodes with plans (s, N + 1, 4)."""
-    observation = np.empty((len(states), task.OBSERVATION_DIM))
-    observation[:, task.STATE] = states
-    observation[:, task.GOAL] = plans[:, -1]
-    observation[:, task.INITIAL_STATE] = plans[:, 0]
-    observation[:, task.TIME] = steps * settings.control_period
+    """Return what the environment shows at states of episodes.
+
+    Args:
+        task: The task.
+        states: x, shape (s, n).
+        steps: Control step of each, shape (s,).
+        plan: Which plan each belongs to, shape (s,).
+        plans: `plan_states`, `plan_starts` and `plan_discs`, as in `ExpertData`.
+    """
+    layout = task.layout
+    observation = np.empty((len(states), layout.size))
+    observation[:, layout.state] = states
+    observation[:, layout.goal] = plans["plan_states"][plan, -1]
+    observation[:, layout.initial_state] = plans["plan_starts"][plan]
+    observation[:, layout.time] = steps * task.control_period
+    discs = plans["plan_discs"][plan]
+    observation[:, layout.discs] = discs.reshape(len(states), 3 * task.most_discs)
     return observation
 
 
@@ -124,10 +145,11 @@ def generate(
     folder: Path,
     metric: Metric,
     settings: ExpertDataSettings,
-    task_settings: task.CartPoleSettings | None = None,
+    task: Task | None = None,
     jobs: int = 1,
     on_shard: Callable[[int], None] | None = None,
     backend: Backend = LOKY,
+    network: Mlp | None = None,
 ) -> ExpertData:
     """Generate expert data, or finish what an interrupted call began.
 
@@ -135,10 +157,12 @@ def generate(
         folder: Where the shards are kept.
         metric: The contraction metric behind u*.
         settings: What to generate.
-        task_settings: The task.
+        task: The task; the paper's if left out.
         jobs: Processes.
         on_shard: Called with the number of shards that are finished.
         backend: Whose processes they are.
+        network: Plan from where it comes to in the episodes, as DAgger does, and not from their
+            starts.
 
     Returns:
         All samples, in an order that does not depend on the processes.
@@ -146,32 +170,40 @@ def generate(
     Raises:
         ValueError: The folder holds data of other settings, or a shard is damaged.
     """
-    task_settings = task_settings or task.CartPoleSettings()
-    make = partial(make_shard, metric=metric, settings=settings, task_settings=task_settings)
-    record = _record(metric, settings, task_settings)
+    task = task_of(task)
+    make = partial(make_shard, metric=metric, settings=settings, task=task, network=network)
+    record = _record(metric, settings, task, network)
     return _join(make_shards(folder, settings.shards, make, record, jobs, on_shard, backend))
 
 
 def make_shard(
-    index: int, metric: Metric, settings: ExpertDataSettings, task_settings: task.CartPoleSettings
+    index: int,
+    metric: Metric,
+    settings: ExpertDataSettings,
+    task: Task,
+    network: Mlp | None = None,
 ) -> Shard:
     """Generate one shard: plan, fill the tubes, keep the verified region, label."""
-    expert = CartPoleExpert(metric, task_settings)
+    expert = Expert(task, metric)
     count = settings.plans // settings.shards
     seeds = episode_seeds(settings.seed, settings.plans)[index * count : (index + 1) * count]
-    plans = []
-    for seed in seeds:
-        scenario = task.sample_scenario(episode_streams(seed).scenario, task_settings)
-        plan = expert.planner.plan(scenario.initial_state, scenario.goal)
-        # A plan that does not hold is no target; the share is reported with the data.
-        if plan.solved:
-            plans.append(plan)
-    if not plans:
-        raise ValueError(f"none of the {count} episodes of shard {index} has a plan")
-    states = np.stack([plan.states for plan in plans])
-    controls = np.stack([plan.controls for plan in plans])
-    tracked = expert.track(states, controls)
+    episodes = [task.sample(episode_streams(seed).scenario) for seed in seeds]
     rng = np.random.default_rng([settings.seed, index])
+    if network is None:
+        plans = [(one, 0, _planned(expert, one, one.initial_state, 0)) for one in episodes]
+    else:
+        pushes = _pushes(rng, len(episodes), task, settings.disturbance_bound)
+        met = met_states(rng, task, network, episodes, pushes)
+        plans = [
+            (episodes[which], step, _planned(expert, episodes[which], state, step))
+            for which, step, state in met
+        ]
+    held = [(episode, step, plan) for episode, step, plan in plans if plan is not None]
+    if not held:
+        raise ValueError(f"none of the {count} episodes of shard {index} has a plan")
+    shard = _plan_arrays(task, held)
+    states, controls, first = (shard[f"plan_{name}"] for name in ("states", "controls", "steps"))
+    tracked = expert.track(states, controls)
     wanted = settings.samples // settings.shards
     parts: list[tuple[FloatArray, FloatArray, IntArray]] = []
     kept = drawn = 0
@@ -181,7 +213,7 @@ def make_shard(
                 f"only {kept} of {drawn} states lie in the verified region {metric.region}: "
                 "verify a larger region or lower disturbance_bound"
             )
-        points, plan_of, step = tube_states(rng, expert, tracked, settings)
+        points, plan_of, step = tube_states(rng, expert, tracked, settings, first)
         choice = rng.permutation(len(points))
         points, plan_of, step = points[choice], plan_of[choice], step[choice]
         nominal, nominal_control = states[plan_of, step], controls[plan_of, step]
@@ -192,24 +224,59 @@ def make_shard(
         inside, drawn = inside[:needed], drawn + len(points)
         points, plan_of, step = points[inside], plan_of[inside], step[inside]
         label = expert.control(tracked, plan_of, step, points)
-        parts.append((observations(points, states[plan_of], step, task_settings), label, plan_of))
+        parts.append((observations(task, points, step, plan_of, shard), label, plan_of))
         kept += len(points)
     observation, control, plan_of = (np.concatenate(part) for part in zip(*parts, strict=True))
+    samples = {"observation": observation, "control": control, "plan": plan_of}
+    return {**samples, **shard, "drawn": np.array(drawn)}
+
+
+def _planned(expert: Expert, episode: Scenario, state: FloatArray, step: int) -> Trajectory | None:
+    """Return a plan from a state of an episode; None where there is none that holds."""
+    plan = expert.planner.plan(state, episode.goal, step, discs=episode.discs)
+    # One that does not hold is no target; the share is reported with the data.
+    return plan if plan.solved else None
+
+
+def _plan_arrays(task: Task, held: Sequence[tuple[Scenario, int, Trajectory]]) -> Shard:
+    """Return plans as `ExpertData` has them."""
+    states = np.stack([_from_first(plan.states, task.steps + 1) for _, _, plan in held])
+    controls = [_from_first(plan.controls, task.steps) for _, _, plan in held]
     return {
-        "observation": observation,
-        "control": control,
-        "plan": plan_of,
         "plan_states": states,
-        "plan_controls": controls,
-        "drawn": np.array(drawn),
+        "plan_controls": np.stack(controls),
+        "plan_steps": np.array([step for _, step, _ in held]),
+        "plan_starts": np.stack([episode.initial_state for episode, _, _ in held]),
+        "plan_discs": np.stack([padded_discs(task, episode) for episode, _, _ in held]),
     }
+
+
+def _from_first(rows: FloatArray, count: int) -> FloatArray:
+    """Return so many rows, the first one repeated before the others."""
+    return np.concatenate([np.repeat(rows[:1], count - len(rows), axis=0), rows])
+
+
+def _pushes(rng: np.random.Generator, count: int, task: Task, bound: float) -> FloatArray:
+    """Draw disturbances of episodes, each of a kind and a bound of its own, shape (p, N, n)."""
+    # Every bound down to zero: the tube of a small disturbance lies inside that of a large one.
+    bounds = bound * rng.random((count, 1, 1))
+    n, period = task.system.state_dim, task.control_period
+    pushes = np.stack(
+        [
+            OPEN_LOOP[_KINDS[rng.integers(len(_KINDS))]].realise(rng, task.steps, n, period)
+            for _ in range(count)
+        ]
+    )
+    pushes *= bounds
+    return pushes
 
 
 def tube_states(
     rng: np.random.Generator,
-    expert: CartPoleExpert,
+    expert: Expert,
     tracked: TrackedPlans,
     settings: ExpertDataSettings,
+    first: IntArray | None = None,
 ) -> tuple[FloatArray, IntArray, IntArray]:
     """Fill the tube around each plan: u* in closed loop under random disturbances (Theorem 4).
 
@@ -221,37 +288,31 @@ def tube_states(
         expert: The law u*.
         tracked: The plans.
         settings: What to generate.
+        first: Step at which each plan begins, shape (p,); all at the first if left out.
 
     Returns:
-        States (p N, 4), the plan and the step of each.
+        States (s, n), the plan and the step of each.
     """
     states = tracked.states
     plans, steps = tracked.controls.shape[:2]
     every = np.arange(plans)
-    period = expert.task.control_period
-    # Every bound down to zero: the tube of a small disturbance lies inside that of a large one.
-    bound: FloatArray = settings.disturbance_bound * rng.random((plans, 1, 1))
-    pushes = np.stack(
-        [
-            OPEN_LOOP[_KINDS[rng.integers(len(_KINDS))]].realise(
-                rng, steps, states.shape[-1], period
-            )
-            for _ in range(plans)
-        ]
-    )
-    pushes *= bound
+    first = np.zeros(plans, int) if first is None else first
+    task, period = expert.task, expert.task.control_period
+    pushes = _pushes(rng, plans, task, settings.disturbance_bound)
     state = states[:, 0]
     met = np.empty((plans, steps, states.shape[-1]))
     for step in range(steps):
         met[:, step] = state
         control = expert.control(tracked, every, np.full(plans, step), state)
-        state = hold_step(expert.task.system, state, control, period, pushes[:, step])
+        following = hold_step(task.system, state, control, period, pushes[:, step])
+        state = np.where((first <= step)[:, None], following, state)
     spread = settings.spread * settings.disturbance_bound * period
     noise = into_unit_ball(rng.standard_normal(met.shape)) * rng.random((plans, steps, 1))
     # The start is known exactly; the tube has radius zero there.
-    noise[:, 0] = 0.0
+    noise[every, first] = 0.0
     met += spread * noise
-    finite = np.all(np.isfinite(met), axis=-1)
+    under_way = np.arange(steps) >= first[:, None]
+    finite = np.all(np.isfinite(met), axis=-1) & under_way
     plan_of, step_of = np.nonzero(finite)
     return met[finite], plan_of, step_of
 
@@ -261,23 +322,27 @@ def _join(shards: list[Shard]) -> ExpertData:
     for shard in shards:
         shard["plan"] = shard["plan"] + offset
         offset += len(shard["plan_states"])
-    joined = {
-        name: np.concatenate([shard[name] for shard in shards])
-        for name in ("observation", "control", "plan", "plan_states", "plan_controls")
-    }
+    names = [item.name for item in fields(ExpertData) if item.name != "drawn"]
+    joined = {name: np.concatenate([shard[name] for shard in shards]) for name in names}
     return ExpertData(**joined, drawn=int(sum(int(shard["drawn"]) for shard in shards)))
 
 
 def _record(
-    metric: Metric, settings: ExpertDataSettings, task_settings: task.CartPoleSettings
+    metric: Metric, settings: ExpertDataSettings, task: Task, network: Mlp | None
 ) -> dict[str, Any]:
     """Return all that the data depend on."""
     law = {
         "coefficients": hashlib.sha256(metric.coefficients.tobytes()).hexdigest(),
         "alpha": metric.contraction_rate,
         "region": region_record(metric.region),
-        "feedback": asdict(CartPoleExpert(metric, task_settings).feedback),
+        "feedback": asdict(Expert(task, metric).feedback),
     }
     if metric.basis is not None:
         law |= {"basis": list(metric.basis.terms), "point": metric.point}
-    return {"data": asdict(settings), "task": asdict(task_settings), "metric": law}
+    record: dict[str, Any] = {"data": asdict(settings), "task": asdict(task), "metric": law}
+    if network is not None:
+        digest = hashlib.sha256()
+        for part in (*network.weights, *network.biases):
+            digest.update(part.tobytes())
+        record["network"] = digest.hexdigest()
+    return record

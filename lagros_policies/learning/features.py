@@ -9,13 +9,14 @@ the functions that are passed to it, and nothing else.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.numbers import functions
 from lagros_envs.task import Task
+from lagros_policies.learning.layers import Alike
 from lagros_policies.room import part_of
 
 Float32Array = NDArray[np.float32]
@@ -83,10 +84,48 @@ def seen(see: See, observation: Float32Array) -> tuple[Float32Array, Float32Arra
     )
 
 
-def see_of(task: Task) -> See:
-    """Return what the networks of a task see: its own way of seeing, or the usual one."""
-    see: See = part_of(task, "SEE", "lagros_policies.learning.features:Usual")(task)
-    return see
+class View(Protocol):
+    """What the networks of a task see of an observation; built of the task.
+
+    Attributes:
+        names: Of the features.
+        alike: Which of them are of things that are alike; None for none.
+    """
+
+    names: tuple[str, ...]
+    alike: Alike | None
+
+    def __call__(self, observation: Sequence[Any], functions: Any) -> Seen:
+        """See an observation, given by its components."""
+
+
+def view_of(task: Task) -> View:
+    """Return what the networks of a task see: what the task says, or the usual view."""
+    if task.features is not None:
+        return Stated(task)
+    view: View = part_of(task, "VIEW", "lagros_policies.learning.features:Usual")(task)
+    return view
+
+
+class Stated:
+    """What `task.features` says.
+
+    Args:
+        task: The task.
+    """
+
+    alike: Alike | None = None
+
+    def __init__(self, task: Task) -> None:
+        """Count what it says."""
+        self.task = task
+        count = len(self([1.0] * task.layout.size, functions).features)
+        self.names = tuple(f"feature {index}" for index in range(count))
+
+    def __call__(self, observation: Sequence[Any], functions: Any) -> Seen:
+        """See an observation, given by its components."""
+        assert self.task.features is not None
+        return Seen(self.task.features(observation, functions))
 
 
 class Usual:
@@ -102,13 +141,14 @@ class Usual:
 
     Attributes:
         names: Of the features.
-        discs: Of how many discs the last features are, as many of each.
+        alike: How many discs the last features are of.
     """
 
     def __init__(self, task: Task) -> None:
         """Look at the coordinates."""
         n = task.system.state_dim
-        self.task, self.discs = task, task.most_discs if task.position else 0
+        self.task, self._discs = task, task.most_discs if task.position else 0
+        self.alike = Alike(self._discs, len(_DISC)) if self._discs else None
         names = task.state_names or tuple(f"x{index}" for index in range(n))
         self._placed = task.position or tuple(range(n))
         self._others = tuple(index for index in range(n) if index not in self._placed)
@@ -121,7 +161,7 @@ class Usual:
             *(f"{part} {names[index]}" for index in self._angles for part in ("sin", "cos")),
             "time left [s]",
             *(_MOTION if task.position else ()),
-            *(f"{part} of disc {disc}" for disc in range(self.discs) for part in _DISC),
+            *(f"{part} of disc {disc}" for disc in range(self._discs) for part in _DISC),
         )
 
     def __call__(self, observation: Sequence[Any], functions: Any) -> Seen:
@@ -141,7 +181,7 @@ class Usual:
             features += [distance, *ahead, *motion, speed, *_turned(motion, ahead)]
             here = [state[index] for index in task.position]
             discs = observation[layout.discs]
-            for place in range(0, 3 * self.discs, 3):
+            for place in range(0, 3 * self._discs, 3):
                 disc = discs[place : place + 3]
                 features += self._disc(disc, here, ahead, course, functions)
         return Seen(features)

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_each, check_fields, check_positive, check_seed, check_whole
-from lagros_policies.learning.fitting import Fit, IntArray, dense, layers_in, one_thread
+from lagros_policies.learning.checkpoint import load_values
+from lagros_policies.learning.fitting import Fit, IntArray, one_thread
+from lagros_policies.learning.layers import Alike, network_of, new_layers, outputs_of
 from lagros_policies.learning.networks import Mlp
 
 if TYPE_CHECKING:
@@ -27,7 +29,9 @@ class TrainingSettings:
     """How to fit.
 
     Attributes:
-        hidden: Width of each hidden layer; the paper's network is 3 layers of 100.
+        hidden: Width of each hidden layer; the paper's network is 3 layers of 100. Where some
+            inputs are of things that are alike, such as discs, those of the first two layers are
+            for each of these, and for the rest.
         epochs: Passes over the data.
         batch: Samples per step.
         learning_rate: Adam's step at first; a cosine takes it to a hundredth of that.
@@ -93,6 +97,9 @@ def fit(
     settings: TrainingSettings,
     checkpoint: Path,
     on_epoch: Callable[[int, float], None] | None = None,
+    alike: Alike | None = None,
+    after: Path | None = None,
+    first: int | None = None,
 ) -> Mlp:
     """Fit a network by Adam on the mean of ||u_L - u*||, the loss of the paper.
 
@@ -102,12 +109,19 @@ def fit(
         settings: How to fit.
         checkpoint: File that holds the progress; removed by nobody, resumed from if it fits.
         on_epoch: Called with the epochs done and the last epoch's loss.
+        alike: Which inputs are of things that are alike; None for none.
+        after: Checkpoint of a fit that ended, with whose weights this one begins.
+        first: How many of the samples say how inputs and outputs are scaled, the first ones, as
+            they did in that fit; None for all.
 
     Returns:
         The network, with the normalisation folded in.
+
+    Raises:
+        ValueError: A checkpoint is damaged, or of other settings or data.
     """
     with one_thread():
-        run = _Run(features, labels, settings, checkpoint)
+        run = _Run(features, labels, settings, checkpoint, alike, after, first)
         run.finish(on_epoch)
         return run.network()
 
@@ -121,18 +135,27 @@ class _Run(Fit[TrainingSettings]):
         labels: Float32Array,
         settings: TrainingSettings,
         checkpoint: Path,
+        alike: Alike | None,
+        after: Path | None,
+        first: int | None,
     ) -> None:
         import torch
 
-        self.input_mean, self.input_scale = _statistics(features)
-        self.output_mean, self.output_scale = _statistics(labels)
+        self.alike = alike
+        self.input_mean, self.input_scale = _statistics(features[:first], alike)
+        self.output_mean, self.output_scale = _statistics(labels[:first])
         self.features = torch.from_numpy((features - self.input_mean) / self.input_scale)
         self.labels = torch.from_numpy((labels - self.output_mean) / self.output_scale)
         torch.manual_seed(settings.seed)
         widths = [features.shape[1], *settings.hidden, labels.shape[1]]
-        self.model = dense(widths, torch.nn.Tanh)[:-1]
-        data = hashlib.sha256(features.tobytes() + labels.tobytes()).hexdigest()
-        super().__init__(settings, checkpoint, list(self.model.parameters()), len(features), data)
+        self.layers = new_layers(widths, alike)
+        data = hashlib.sha256(features.tobytes() + labels.tobytes())
+        parameters = [value for layer in self.layers for value in layer.parameters()]
+        if after is not None:
+            load_values(after, parameters)
+            for value in parameters:
+                data.update(value.detach().numpy().tobytes())
+        super().__init__(settings, checkpoint, parameters, len(features), data.hexdigest())
 
     def batches(self, order: IntArray) -> list[IntArray]:
         """Cut off full batches; the last one holds the rest."""
@@ -144,13 +167,13 @@ class _Run(Fit[TrainingSettings]):
         import torch
 
         rows = torch.from_numpy(batch)
-        error = self.model(self.features[rows]) - self.labels[rows]
+        error = outputs_of(self.layers, self.features[rows], self.alike) - self.labels[rows]
         # The paper's loss is the norm of the error; smoothed at zero so that it has a gradient.
         return torch.sqrt((error * error).sum(1) + 1e-6).mean()
 
     def network(self) -> Mlp:
         """Return the network with the normalisation folded into its first and last layer."""
-        weights, biases = (list(part) for part in zip(*layers_in(self.model), strict=True))
+        weights, biases = network_of(self.layers, self.alike)
         weights[0] = weights[0] / self.input_scale[:, None]
         biases[0] = biases[0] - self.input_mean @ weights[0]
         weights[-1] = weights[-1] * self.output_scale
@@ -158,7 +181,16 @@ class _Run(Fit[TrainingSettings]):
         return Mlp(weights, biases)
 
 
-def _statistics(values: Float32Array) -> tuple[Float32Array, Float32Array]:
+def _statistics(
+    values: Float32Array, alike: Alike | None = None
+) -> tuple[Float32Array, Float32Array]:
     deviation = values.std(axis=0, dtype=np.float64).astype(np.float32)
     mean = values.mean(axis=0, dtype=np.float64).astype(np.float32)
+    if alike is not None:
+        # One scale for all discs; the zeros of those that are not there say nothing of it.
+        rows = values[:, -alike.things * alike.size :].reshape(-1, alike.size)
+        for part, scale in zip(
+            (mean, deviation), _statistics(rows[rows[:, -1] > 0.0]), strict=True
+        ):
+            part[-alike.things * alike.size :] = np.tile(scale, alike.things)
     return mean, np.where(deviation > 0.0, deviation, np.float32(1.0))

@@ -22,10 +22,10 @@ from typer.testing import CliRunner
 from lagros_benchmarks.commands import cli
 from lagros_benchmarks.report.records import summarise
 from lagros_benchmarks.run.files import plain
+from lagros_benchmarks.run.reproduce import ReproduceSettings
 from lagros_benchmarks.run.reproduction import reproduce
 from lagros_benchmarks.run.runner import run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings
-from lagros_benchmarks.tasks.cartpole.reproduce import ReproduceSettings
 from lagros_policies.backends import (
     ATTEMPTS,
     LOKY,

@@ -7,9 +7,9 @@ import filecmp
 import numpy as np
 import pytest
 
+from lagros_benchmarks.run.reproduce import ReproduceSettings
 from lagros_benchmarks.run.reproduction import reproduce
 from lagros_benchmarks.run.runner import run_benchmark
-from lagros_benchmarks.tasks.cartpole.reproduce import ReproduceSettings
 from lagros_benchmarks.tasks.spacecraft.reproduce import (
     SpacecraftReproduceSettings,
     training_part,

@@ -103,7 +103,8 @@ def test_labels_are_the_expert_control(data, metric):
 
 
 def test_nominal_pairs_are_the_plans_step_by_step(data):
-    observation, control = data.nominal_pairs(CartPoleSettings())
+    observation, control, plan = data.nominal_pairs(CartPoleSettings())
+    assert np.array_equal(plan, np.repeat(np.arange(8), 90))
     assert observation.shape == (8 * 90, 13)
     row = 0
     for states, controls in zip(data.plan_states, data.plan_controls, strict=True):

@@ -11,8 +11,14 @@ from safetensors.numpy import save
 
 from lagros_envs.tasks.cartpole import task
 from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.learning.features import seen
 from lagros_policies.learning.networks import Mlp, read_safetensors, write_safetensors
-from lagros_policies.tasks.cartpole.features import FEATURES, cartpole_features
+from lagros_policies.tasks.cartpole.features import CartPoleView
+
+
+def cartpole_view(observation):
+    features, side = seen(CartPoleView(), observation)
+    return features, side[..., 0]
 
 
 def random_network(widths, seed=0):
@@ -188,8 +194,8 @@ MIRRORED = np.array([-1.0] * 12 + [1.0], np.float32)
 
 @given(observations)
 def test_features_name_what_they_hold(observation):
-    features, side = cartpole_features(observation)
-    assert features.shape == (len(FEATURES),) == (7,)
+    features, side = cartpole_view(observation)
+    assert features.shape == (len(CartPoleView.names),) == (7,)
     p, angle, speed, turn = observation[:4]
     expected = np.array(
         [
@@ -213,8 +219,8 @@ def test_mirrored_observation_has_the_same_features_and_the_other_side(observati
     # An episode that starts upright has no side: both mirror images are taken for the right.
     if observation[9] == 0.0:
         observation[9] = 0.1
-    features, side = cartpole_features(observation)
-    mirrored, other = cartpole_features(MIRRORED * observation)
+    features, side = cartpole_view(observation)
+    mirrored, other = cartpole_view(MIRRORED * observation)
     assert np.array_equal(features, mirrored)
     assert other == -side
 
@@ -223,16 +229,16 @@ def test_mirrored_observation_has_the_same_features_and_the_other_side(observati
 def test_features_do_not_depend_on_where_the_track_begins(observation, shift):
     moved = observation.copy()
     moved[POSITIONS] += np.float32(shift)
-    assert cartpole_features(moved)[0] == pytest.approx(cartpole_features(observation)[0], abs=1e-5)
+    assert cartpole_view(moved)[0] == pytest.approx(cartpole_view(observation)[0], abs=1e-5)
 
 
 def test_features_of_a_batch_are_those_of_its_rows_and_leave_the_observation_alone():
     batch = np.random.default_rng(2).standard_normal((5, 6, 13)).astype(np.float32)
     before = batch.copy()
-    features, side = cartpole_features(batch)
+    features, side = cartpole_view(batch)
     assert np.array_equal(batch, before)
     assert (features.shape, side.shape) == ((5, 6, 7), (5, 6))
     for index in np.ndindex(5, 6):
-        one, its_side = cartpole_features(batch[index])
+        one, its_side = cartpole_view(batch[index])
         assert np.array_equal(one, features[index])
         assert its_side == side[index]

@@ -15,11 +15,17 @@ from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies import NAMES, Policy, make
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.learned import LearnedPolicy
-from lagros_policies.tasks.cartpole.features import cartpole_features
+from lagros_policies.learning.features import seen
+from lagros_policies.tasks.cartpole.features import CartPoleView
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
 SHORT = CartPoleSettings(time_limit=3.0, goal_range=1.0)
 OURS = ("learned", "tube-mpc", "lagros")
+
+
+def cartpole_view(observation):
+    features, side = seen(CartPoleView(), observation)
+    return features, side[..., 0]
 
 
 def make_env(**settings):
@@ -221,7 +227,7 @@ def test_force_does_not_depend_on_the_unit_of_the_action(metric, weights_file, o
 def test_network_policy_is_its_network_on_the_features(cls, network, weights_file, observations):
     policy = cls(weights=weights_file)
     action, state = policy.predict(observations, "kept")
-    features, side = cartpole_features(observations)
+    features, side = cartpole_view(observations)
     assert action[:, 0] == pytest.approx(network(features)[:, 0] * side / 40.0, rel=1e-5)
     assert state == "kept"
     assert policy.bare_forward(features[0]) == pytest.approx(network(features[0]))

@@ -42,7 +42,7 @@ _MOVED = {
     "cartpole_experiment": "run.single",
     "cartpole_records": "report.single",
     "cartpole_tables": "report.single_tables",
-    "reproduce": "tasks.cartpole.reproduce",
+    "reproduce": "run.reproduce",
     "worst_case.cartpole": "worst_case.single",
     "training.cartpole": "tasks.cartpole.training",
     "spacecraft_episodes": "tasks.spacecraft.episodes",

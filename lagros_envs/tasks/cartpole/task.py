@@ -19,7 +19,7 @@ from lagros_envs.checks import (
     check_positive,
 )
 from lagros_envs.draw import Renderer
-from lagros_envs.task import LARGEST_CONTROL, LARGEST_DISTANCE, Layout, Scenario, Task
+from lagros_envs.task import LARGEST_CONTROL, LARGEST_DISTANCE, Layout, Learning, Scenario, Task
 from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tube import PaperTube
 from lagros_envs.values import use_plain_numbers
@@ -75,6 +75,7 @@ class CartPoleSettings(Task):
     state_names = ("p [m]", "theta [rad]", "dp/dt [m/s]", "dtheta/dt [rad/s]")
     control_names = ("force [N]",)
     rates = (2, 3)
+    learning = Learning()
     short_goal = (0,)
 
     def __post_init__(self) -> None:

@@ -52,16 +52,27 @@ class PvtolSettings(Task):
     most_discs = 5
     margin = 0.25
     metric = MetricDesign(
-        low=(-20.0, -20.0, -_TILT, -2.0, -1.0, -_TILT),
-        high=(20.0, 20.0, _TILT, 2.0, 1.0, _TILT),
+        low=(-5.0, -5.0, -_TILT, -2.0, -1.0, -_TILT),
+        high=(10.0, 5.0, _TILT, 2.0, 1.0, _TILT),
         error=(0.5, 0.5, 0.3, 0.5, 0.5, 0.5),
         control_low=(_HOVER - 1.0,) * 2,
         control_high=(_HOVER + 1.0,) * 2,
         basis=("1", "cos(x[2])", "sin(x[2])", "x[3]"),
         scaling=(1.0, 1.0, 3.0, 1.0, 1.0, 1.0),
     )
-    feedback = Feedback((10.0, 10.0, 1.0, 1.0, 1.0, 0.1), (1.0, 1.0))
-    learning = Learning(plans=2000, disturbance_bound=0.4, hidden=(128, 128, 128), rounds=4)
+    feedback = Feedback((1.0, 1.0, 0.3, 0.3, 0.3, 0.03), (10.0, 10.0))
+    learning = Learning(
+        plans=3000,
+        samples=180_000,
+        disturbance_bound=0.3,
+        hidden=(64, 64, 128, 128),
+        epochs=30,
+        learned_epochs=30,
+        rounds=3,
+        round_plans=2000,
+        round_samples=60_000,
+        round_epochs=12,
+    )
     defaults = Defaults(bounds=(0.3,), bound=0.3)
 
     @property

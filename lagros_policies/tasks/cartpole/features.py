@@ -9,52 +9,45 @@ constant over an episode.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from lagros_envs.tasks.cartpole import task
 from lagros_envs.tasks.cartpole.physics import ANGLE, POSITION
-from lagros_policies.learning.features import Seen, seen
+from lagros_policies.learning.features import Seen
 
-Float32Array = NDArray[np.float32]
-
-FEATURES = (
-    "position - goal [m]",
-    "angle [rad]",
-    "velocity [m/s]",
-    "angular rate [rad/s]",
-    "goal - start [m]",
-    "initial angle [rad]",
-    "time [s]",
-)
 _STATE, _GOAL, _START = task.STATE.start, task.GOAL.start, task.INITIAL_STATE.start
 
 
-def see(observation: Sequence[Any], functions: Any) -> Seen:
-    """Return `FEATURES` and the side of an observation."""
-    lean = observation[_START + ANGLE]
-    side = functions.where(-lean > 0.0, -1.0, 1.0)
-    goal = observation[_GOAL + POSITION]
-    sided = [
-        observation[_STATE + POSITION] - goal,
-        *(observation[index] for index in range(_STATE + ANGLE, task.STATE.stop)),
-        goal - observation[_START + POSITION],
-        lean,
-    ]
-    return Seen([*(side * number for number in sided), observation[task.TIME]], (side,))
-
-
-def cartpole_features(observation: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Return the features and the side of each observation.
+class CartPoleView:
+    """What the networks see, see above; the sign is the side.
 
     Args:
-        observation: Shape (13,) or (B, 13).
-
-    Returns:
-        Features, shape (7,) or (B, 7), and the side +-1, shape () or (B,): the control is the
-        network's output times the side.
+        settings: The task, of which nothing is needed.
     """
-    features, signs = seen(see, observation)
-    return features, cast("Float32Array", signs)[..., 0]
+
+    names = (
+        "position - goal [m]",
+        "angle [rad]",
+        "velocity [m/s]",
+        "angular rate [rad/s]",
+        "goal - start [m]",
+        "initial angle [rad]",
+        "time [s]",
+    )
+    alike = None
+
+    def __init__(self, settings: task.CartPoleSettings | None = None) -> None:
+        """Need nothing."""
+
+    def __call__(self, observation: Sequence[Any], functions: Any) -> Seen:
+        """See an observation, given by its components."""
+        lean = observation[_START + ANGLE]
+        side = functions.where(-lean > 0.0, -1.0, 1.0)
+        goal = observation[_GOAL + POSITION]
+        sided = [
+            observation[_STATE + POSITION] - goal,
+            *(observation[index] for index in range(_STATE + ANGLE, task.STATE.stop)),
+            goal - observation[_START + POSITION],
+            lean,
+        ]
+        return Seen([*(side * number for number in sided), observation[task.TIME]], (side,))

@@ -61,6 +61,10 @@ class MetricDesignSettings:
         for name in ("plans", "pool", "checks"):
             check_whole(name, getattr(self, name))
 
+    def design(self, task: task.CartPoleSettings) -> Metric:
+        """Return the metric; see `design_cartpole_metric`."""
+        return design_cartpole_metric(self, task)
+
 
 def design_cartpole_metric(
     settings: MetricDesignSettings | None = None,

@@ -5,5 +5,4 @@ from lagros_benchmarks.run.room import Room
 ROOM = Room(
     attack="lagros_benchmarks.tasks.cartpole.attack:CartPoleBench",
     certify="lagros_benchmarks.tasks.cartpole.certify:certify",
-    reproduce="lagros_benchmarks.tasks.cartpole.reproduce:ReproduceSettings",
 )

@@ -1,0 +1,111 @@
+"""The layers of a network in training, some of which treat several discs alike.
+
+What a task's features say of each disc goes through two layers with one set of weights, beside what
+they say of the body, and the results are added up before the layers that follow. So the network
+learns a disc once, whichever it is. Written out with the weights repeated, it is an ordinary
+multilayer perceptron, and that is what is stored, flown and exported.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import torch
+
+FloatArray = NDArray[np.float64]
+
+_OWN = 2  # hidden layers of each disc
+
+
+class Alike(NamedTuple):
+    """Inputs of things that are alike: the last ones, the last of each being its presence.
+
+    Attributes:
+        things: How many there are.
+        size: Inputs of each.
+    """
+
+    things: int
+    size: int
+
+
+def new_layers(widths: Sequence[int], alike: Alike | None) -> list[torch.nn.Linear]:
+    """Return layers with their initial weights.
+
+    Args:
+        widths: Of the inputs, of each hidden layer, of the outputs.
+        alike: Which inputs are of things that are alike. Then the first two layers are two pairs:
+            of each thing, which sees the rest too, and of the rest alone.
+
+    Raises:
+        ValueError: There are too few hidden layers for that.
+    """
+    import torch
+
+    if alike is None:
+        return [torch.nn.Linear(*pair) for pair in itertools.pairwise(widths)]
+    if len(widths) < _OWN + 3:
+        raise ValueError(
+            f"hidden={tuple(widths[1:-1])} must be {_OWN + 1} layers or more: the first {_OWN} are "
+            "for each disc"
+        )
+    rest = widths[0] - alike.things * alike.size
+    shapes = [(rest + alike.size, widths[1]), (rest, widths[1])]
+    shapes += [(widths[1], widths[2])] * 2
+    shapes += [(2 * widths[2], widths[3]), *itertools.pairwise(widths[3:])]
+    return [torch.nn.Linear(*shape) for shape in shapes]
+
+
+def outputs_of(
+    layers: Sequence[torch.nn.Linear], inputs: torch.Tensor, alike: Alike | None
+) -> torch.Tensor:
+    """Return the outputs (s, outputs) for inputs (s, inputs), with tanh between the layers."""
+    import torch
+
+    values = inputs
+    if alike is not None:
+        rest = inputs[:, : -alike.things * alike.size]
+        each = inputs[:, -alike.things * alike.size :].reshape(-1, alike.things, alike.size)
+        beside = rest[:, None].expand(-1, alike.things, -1)
+        things, own = torch.cat([beside, each], -1), rest
+        for of_things, of_rest in zip(layers[0:4:2], layers[1:4:2], strict=True):
+            things, own = torch.tanh(of_things(things)), torch.tanh(of_rest(own))
+        values, layers = torch.cat([things.sum(1), own], 1), layers[4:]
+    for layer in layers[:-1]:
+        values = torch.tanh(layer(values))
+    answer: torch.Tensor = layers[-1](values)
+    return answer
+
+
+def network_of(
+    layers: Sequence[torch.nn.Linear], alike: Alike | None
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Return weights (inputs, outputs) and biases (outputs,) of the network, written out."""
+    parts = [
+        (layer.weight.detach().numpy().astype(np.float64).T, layer.bias.detach().numpy())
+        for layer in layers
+    ]
+    weights = [weight for weight, _ in parts]
+    biases = [bias.astype(np.float64) for _, bias in parts]
+    if alike is None:
+        return weights, biases
+    count, size = alike
+    rest, wide, last = len(weights[1]), len(biases[0]), len(biases[2])
+    first = np.zeros((rest + count * size, (count + 1) * wide))
+    second = np.zeros(((count + 1) * wide, (count + 1) * last))
+    third = np.concatenate([np.tile(weights[4][:last], (count, 1)), weights[4][last:]])
+    for thing in range(count):
+        to = slice(thing * wide, (thing + 1) * wide)
+        first[:rest, to] = weights[0][:rest]
+        first[rest + thing * size : rest + (thing + 1) * size, to] = weights[0][rest:]
+        second[to, thing * last : (thing + 1) * last] = weights[2]
+    first[:rest, count * wide :], second[count * wide :, count * last :] = weights[1], weights[3]
+    pairs = ((biases[0], biases[1]), (biases[2], biases[3]))
+    tiled = [np.concatenate([np.tile(each, count), own]) for each, own in pairs]
+    return [first, second, third, *weights[5:]], [*tiled, *biases[4:]]
