@@ -304,13 +304,12 @@ def test_a_policy_that_plans_is_shown_with_its_plan(invoke, tmp_path):
 
 
 def test_the_safety_filter_is_put_on(invoke, tmp_path, monkeypatch):
+    from lagros_policies.policy import BasePolicy
     from lagros_policies.tasks.spacecraft import safety_filter as safety
 
     seen = {}
 
-    class Filter:
-        observes = "local"
-
+    class Filter(BasePolicy):
         def __init__(self, policy, settings, preset, disturbance_bound):
             seen.update(policy=policy, preset=preset, bound=disturbance_bound)
 

@@ -151,8 +151,8 @@ class BenchmarkSettings:
         jobs: Worker processes.
         chunk: Episodes that a worker takes at a time; worlds that fly in one batch.
         timing_episodes: The published step times come from a serial pass over this many first
-            episodes: with more than one job the workers contend for the processor, and the
-            spacecraft fly in batches.
+            episodes: with more than one job the workers contend for the processor, and worlds of
+            agents fly in batches.
         backend: Whose processes the workers are.
 
     Raises:

@@ -19,7 +19,7 @@ from lagros_envs.disturbances import Situation, onto_unit_sphere
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
-from lagros_policies.policy import BasePolicy
+from lagros_policies.policy import BasePolicy, as_policy
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -313,7 +313,7 @@ class PlansOnce:
 
 def remember_plans(policy: BasePolicy) -> None:
     """Let the joint planner of a policy, if it has one, plan each scenario once."""
-    inner: Any = policy.bare
+    inner: Any = as_policy(policy).bare
     planner = getattr(inner, "planner", None)
     if planner is not None and inner.observes == "global" and not isinstance(planner, PlansOnce):
         inner.planner = PlansOnce(planner)
