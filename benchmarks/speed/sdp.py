@@ -16,14 +16,14 @@ from lagros_policies.contraction import (
     CvStemSettings,
     HeldControl,
     Metric,
-    Region,
     Samples,
     design_metric,
-    load_metric,
     robust_control,
 )
 from lagros_policies.contraction.basis import cosine_powers, cosine_rates
+from lagros_policies.expert import metric_of
 from lagros_policies.tasks.cartpole.metric_design import MetricDesignSettings, tube_samples
+from lagros_policies.tasks.cartpole.region import Region
 from speed.report import Row, Section, Target, timed_row
 from speed.timing import Scale, interleave
 
@@ -86,7 +86,7 @@ def sections(scale: Scale) -> list[Section]:
 
 def _batch(system: System, rounds: int) -> Section:
     """Time u* of a batch of states around plans, under the hold and at will."""
-    metric, settings = load_metric(), task.CartPoleSettings()
+    metric, settings = metric_of(task.CartPoleSettings()), task.CartPoleSettings()
     drawn = tube_samples(MetricDesignSettings(plans=_PLANS), settings, _NAMESPACE, _BATCH)
     rate, place = metric.contraction_rate, (drawn.state, drawn.nominal, drawn.nominal_control)
     held = HeldControl(system, metric, rate, settings.control_period)
@@ -106,7 +106,7 @@ def _batch(system: System, rounds: int) -> Section:
 
 
 def _compare(system: System, samples: Samples, degree: int, rounds: int) -> tuple[list[Row], float]:
-    region, settings = Region(), CvStemSettings(degree=degree)
+    region, settings = Region(), CvStemSettings(degree=degree, scaling=Region.scaling)
     times = interleave(
         {
             "direct": lambda _: design_metric(system, samples, region, settings),

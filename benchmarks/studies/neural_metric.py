@@ -35,23 +35,23 @@ from lagros_envs.tasks.cartpole import task
 from lagros_policies.contraction import (
     ContractionMetric,
     HeldControl,
-    Region,
     Samples,
     contraction_residual,
     extreme_eigenvalues,
-    load_metric,
     verify_metric,
 )
 from lagros_policies.contraction.cvstem import CvStemSettings
-from lagros_policies.remarks.neural.design import solve_on_pool
-from lagros_policies.remarks.neural.metric import (
+from lagros_policies.expert import metric_of
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.metric_design import MetricDesignSettings, tube_samples
+from lagros_policies.tasks.cartpole.neural.design import solve_on_pool
+from lagros_policies.tasks.cartpole.neural.metric import (
     NeuralMetric,
     load_neural_metric,
     save_neural_metric,
 )
-from lagros_policies.remarks.neural.training import fit_network
-from lagros_policies.tasks.cartpole.expert import CartPoleExpert
-from lagros_policies.tasks.cartpole.metric_design import MetricDesignSettings, tube_samples
+from lagros_policies.tasks.cartpole.neural.training import fit_network
+from lagros_policies.tasks.cartpole.region import Region
 
 FloatArray = NDArray[np.float64]
 
@@ -163,7 +163,7 @@ def study(count: int, weights: Path | None) -> list[dict[str, Any]]:
         save_neural_metric(checked, weights)
     metrics: dict[str, ContractionMetric] = {
         "neural": load_neural_metric(weights),
-        "degree 4 (shipped)": load_metric(),
+        "degree 4 (shipped)": metric_of(task.CartPoleSettings()),
     }
     sets = [tube_samples(design, settings, seed, _CHECKS) for seed in _FURTHER]
     rows = []

@@ -38,13 +38,9 @@ from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.actor import PpoPolicy
 from lagros_policies.baselines import LqrPolicy
 from lagros_policies.lagros import LagrosPolicy
-from lagros_policies.remarks.adaptive import (
-    AdaptiveControl,
-    cart_mass_regressor,
-    friction_regressor,
-    largest_gain,
-)
+from lagros_policies.remarks.adaptive import AdaptiveControl, largest_gain
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.remarks import cart_mass_regressor, friction_regressor
 from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
 from lagros_policies.tasks.spacecraft.network_policy import SpacecraftLagrosPolicy
 

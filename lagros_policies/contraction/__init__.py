@@ -1,5 +1,6 @@
 """Contraction metrics (CV-STEM), the robust control u* and the tubes that follow from them."""
 
+from lagros_envs.aliases import moved_names
 from lagros_policies.contraction.basis import Basis, cosines, harmonics, powers, products
 from lagros_policies.contraction.condition import (
     contraction_residual,
@@ -26,7 +27,6 @@ from lagros_policies.contraction.regions import (
     BoxRegion,
     MetricRegion,
     PlanRegion,
-    Region,
     Samples,
 )
 from lagros_policies.contraction.tube import Tube, certified_tube, diverging_bound, tighten
@@ -41,7 +41,6 @@ __all__ = [
     "Metric",
     "MetricRegion",
     "PlanRegion",
-    "Region",
     "Samples",
     "Tube",
     "Verification",
@@ -64,3 +63,5 @@ __all__ = [
     "tighten",
     "verify_metric",
 ]
+
+__getattr__ = moved_names(__name__)

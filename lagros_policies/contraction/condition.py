@@ -161,9 +161,8 @@ def verify_metric(system: System, metric: Verified, samples: Samples, seed: int)
 def search_violation(system: System, metric: ContractionMetric, seed: int) -> tuple[Samples, float]:
     """Look for where the condition fails most on a metric's own region (observed).
 
-    Unlike `verify_metric` it follows the worst triples that it drew to where they are worse. A
-    `Region` of the cart-pole holds triples of which no plan is near, and at which the shipped
-    metric does fail; its plans are what that one is checked on.
+    Unlike `verify_metric` it follows the worst triples that it drew to where they are worse. Where
+    control and state are bounded each for itself there are triples of which no plan is near.
 
     Args:
         system: The system.

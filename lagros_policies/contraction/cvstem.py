@@ -2,8 +2,8 @@
 
 The program of `cvstem_program` imposes the condition at samples and the bounds of W_bar at places.
 A thousand samples make it slow, and almost all of them are slack; so it begins with few, and is
-solved again with those that were broken. The bounds are imposed on a grid of the cart-pole's
-angles, and for any other basis where a search of the region finds them broken.
+solved again with those that were broken. The bounds are imposed on a grid of the coordinate in
+which a region is even, and for any other basis where a search of the region finds them broken.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from lagros_policies.contraction.condition import Samples, contraction_residual,
 from lagros_policies.contraction.cvstem_program import (
     CvStemSettings,
     InfeasibleError,
-    check_asked,
     condition_rows,
+    resolved,
     solve_program,
 )
 from lagros_policies.contraction.metric import Metric
@@ -135,8 +135,8 @@ def design_on_region(
 
     Args:
         system: The system.
-        region: Where the metric must contract; all of it, so that a `Region` of the cart-pole, of
-            which plans use a part, is rather designed on their pool.
+        region: Where the metric must contract; all of it: one of which plans use but a part is
+            rather designed on their pool.
         settings: What to design.
         pool: Triples to draw.
         first: Triples to begin with, and about as many as are added at most each time.
@@ -234,7 +234,7 @@ def _design(
         settings: What to design.
         effort: How to look for what is broken.
     """
-    check_asked(system, settings)
+    named, settings = settings.basis, resolved(system, region, settings)
     where = region, settings.phi, settings.point, system.state_dim
     places = places_of(*where, _BOUND_ANGLES, _BOUND_STATES)
     worst = math.inf
@@ -245,7 +245,7 @@ def _design(
         places = np.concatenate([places[near], outside])
         if len(outside) and least <= _LEAST:
             continue
-        metric = _scaled_metric(scaled, weight, (least, largest), region, settings)
+        metric = _scaled_metric(scaled, weight, (least, largest), region, settings, named)
         pool, residual = _residual(system, metric, pool, effort, turn)
         worst = float(residual.max())
         if worst <= 0.0 and len(outside) == 0:
@@ -345,6 +345,7 @@ def _scaled_metric(
     ends: tuple[float, float],
     region: MetricRegion,
     settings: CvStemSettings,
+    named: Basis | None,
 ) -> Metric:
     """Return the metric in the units of the state.
 
@@ -360,6 +361,6 @@ def _scaled_metric(
         control_weight=weight / least,
         scaling=np.asarray(settings.scaling),
         region=region,
-        basis=settings.basis,
+        basis=named,
         point=settings.point,
     )

@@ -12,7 +12,7 @@ tests; here the matrices go to Clarabel directly, which spares the compilation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,11 @@ from scipy import sparse
 
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 from lagros_envs.dynamics import System, vector_field
-from lagros_envs.tasks.cartpole.physics import ANGLE
-from lagros_policies.contraction.basis import CONSTANT, Basis, cosines
+from lagros_policies.contraction.basis import CONSTANT, Basis
 from lagros_policies.contraction.condition import condition_terms
+from lagros_policies.contraction.metric import default_basis
 from lagros_policies.contraction.places import Point
-from lagros_policies.contraction.regions import MetricRegion, Samples
+from lagros_policies.contraction.regions import MetricRegion, Samples, even_coordinate
 from lagros_policies.contraction.semidefinite import (
     ConeProgram,
     cone_rows,
@@ -35,8 +35,6 @@ from lagros_policies.contraction.semidefinite import (
 from lagros_policies.contraction.systems import check_basis_unmoved, check_sizes
 
 FloatArray = NDArray[np.float64]
-
-_STATES = 4  # of the cart-pole
 
 
 class InfeasibleError(ValueError):
@@ -49,11 +47,13 @@ class CvStemSettings:
 
     Attributes:
         contraction_rate: alpha [1/s].
-        degree: Degree of W_bar in cos(theta); 0 is a constant metric. A basis takes its place.
+        degree: Degree of W_bar in cos(x_i), x_i the even coordinate of the region; 0 is a constant
+            metric. A basis takes its place.
         control_penalty: lambda, the weight of nu; zero is ill-posed.
         margin: Added to alpha at the samples, so that the condition holds between them [1/s].
-        scaling: Diagonal of S, the units in which chi is measured, one per state.
-        basis: phi_i of W_bar; None for 1, cos(theta), ... of the cart-pole's angle.
+        scaling: Diagonal of S, the units in which chi is measured, one per state; () for those of
+            the region, or ones.
+        basis: phi_i of W_bar; None for 1, cos(x_i), ...
         point: Whether they are functions of x ("state") or of x_d ("nominal").
 
     Raises:
@@ -64,7 +64,7 @@ class CvStemSettings:
     degree: int = 4
     control_penalty: float = 0.1
     margin: float = 0.05
-    scaling: tuple[float, ...] = (1.0, 12.0, 1.0, 1.5)
+    scaling: tuple[float, ...] = ()
     basis: Basis | None = None
     point: Point = "state"
 
@@ -83,27 +83,31 @@ class CvStemSettings:
 
     @property
     def phi(self) -> Basis:
-        """The functions phi_i."""
-        return self.basis or cosines(ANGLE, self.degree)
+        """The functions phi_i, where they are named or W_bar is constant."""
+        return self.basis or CONSTANT
 
 
-def check_asked(system: System, settings: CvStemSettings) -> None:
-    """Check that scaling and basis are of the states of a system.
+def resolved(system: System, region: MetricRegion, settings: CvStemSettings) -> CvStemSettings:
+    """Return settings whose basis and scaling are given, and those of a system.
 
     Raises:
-        ValueError: They are not.
+        ValueError: They are of other states, or the degree is that of no coordinate.
     """
-    n, phi = system.state_dim, settings.phi
-    check_sizes(system, scaling=(np.asarray(settings.scaling), (n,)))
-    if settings.basis is None and settings.degree > 0 and n != _STATES:
-        raise ValueError(
-            f"degree={settings.degree!r} is that of the cart-pole's cos(theta), and {system!r} has "
-            f"{n} states: name a basis, or take degree=0"
-        )
+    n, phi = system.state_dim, settings.basis
+    scaling = settings.scaling or getattr(region, "scaling", (1.0,) * n)
+    check_sizes(system, scaling=(np.asarray(scaling), (n,)))
+    if phi is None:
+        if settings.degree > 0 and even_coordinate(region) is None:
+            raise ValueError(
+                f"degree={settings.degree!r} is that of the even coordinate of a region, and a "
+                f"{type(region).__name__} has none: name a basis, or take degree=0"
+            )
+        phi = default_basis(region, settings.degree)
     if phi != CONSTANT and max(phi.coordinates) >= n:
         raise ValueError(
             f"basis: x[{max(phi.coordinates)}] is none of the {n} states of {system!r}"
         )
+    return replace(settings, basis=phi, scaling=tuple(scaling))
 
 
 def solve_program(
@@ -130,7 +134,8 @@ def solve_program(
     )
     asked = f"alpha={settings.contraction_rate} (margin {settings.margin})"
     if status in ("PrimalInfeasible", "AlmostPrimalInfeasible"):
-        kind = f"of degree {settings.degree}" if settings.basis is None else "of this basis"
+        cosine = settings.phi.cosine is not None or settings.phi == CONSTANT
+        kind = f"of degree {settings.phi.degree}" if cosine else "of this basis"
         raise InfeasibleError(
             f"no contraction metric {kind} with {asked} exists on {region}: lower alpha or the "
             "margin, raise the degree, or shrink the region"

@@ -108,7 +108,7 @@ class TubeControl:
     dV/dt <= -2 alpha V. Closed form, for a control at will.
 
     Attributes:
-        system: The cart-pole.
+        system: The system.
         tube: The tube.
 
     Raises:

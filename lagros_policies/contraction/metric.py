@@ -10,23 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_at_least, check_name, check_positive, check_whole
-from lagros_envs.tasks.cartpole.physics import ANGLE
 from lagros_policies.contraction.basis import CONSTANT, MOST_DEGREE, Basis, cosines
 from lagros_policies.contraction.places import (
     Point,
-    at_angles,
+    along,
     extreme_places,
-    is_of_the_angle,
     places_of,
 )
-from lagros_policies.contraction.regions import MetricRegion, Region
+from lagros_policies.contraction.regions import MetricRegion, even_coordinate
 
 FloatArray = NDArray[np.float64]
 
-_STATES = 4  # of a metric of the cart-pole: [p, theta, dp/dt, dtheta/dt]
-# Angles, or states of the region, at which W_bar must be positive definite, and its least
+# Points of a grid, or states of the region, at which W_bar must be positive definite, and its least
 # eigenvalue, of W_bar scaled to a unit diagonal: far above rounding, far below any design.
-_ANGLES = 101
+_POINTS = 101
 _PLACES = 1000
 _LEAST = 1e-13
 # Rounding of W_ij against W_ji, as a share of the largest entry.
@@ -131,8 +128,8 @@ class Metric:
         scaling: Diagonal of S, the units in which chi is measured, shape (n,).
         region: Where the metric was designed.
         verification: The independent check, or None.
-        basis: phi_i; None for 1, cos(theta), ... cos(theta)^(k-1) of the cart-pole's angle, and
-            for a constant metric of any states.
+        basis: phi_i; None for a constant metric, and for 1, cos(x_i), ... cos(x_i)^(k-1) of the
+            even coordinate of the region, where it has one.
         point: "state", where the phi_i are functions of x, or "nominal", where they are of x_d.
 
     Raises:
@@ -174,22 +171,22 @@ class Metric:
         count, size = shape[:2]
         check_name("point", self.point, get_args(Point))
         if self.basis is None:
-            if count > 1 and size != _STATES:
+            if count > 1 and even_coordinate(self.region) is None:
                 raise ValueError(
-                    f"coefficients of shape {shape}: without a basis W_bar is of the angle of the "
-                    "four states [p, theta, dp/dt, dtheta/dt]; name the basis of one of other "
-                    "states, or make it constant, with one coefficient"
+                    f"coefficients of shape {shape}: without a basis W_bar is constant, or of the "
+                    f"even coordinate of a region, and a {type(self.region).__name__} has none: "
+                    "name the basis, or give one coefficient"
                 )
             if count > MOST_DEGREE + 1:
                 raise ValueError(f"coefficients: degree {count - 1} must be at most {MOST_DEGREE}")
-        elif self.basis.size != count:
+        if self.phi.size != count:
             raise ValueError(
-                f"coefficients of shape {shape} are {count}, and the basis has {self.basis.size} "
+                f"coefficients of shape {shape} are {count}, and the basis has {self.phi.size} "
                 "functions"
             )
-        elif self.basis.degree and max(self.basis.coordinates) >= size:
+        if self.phi.degree and max(self.coordinates) >= size:
             raise ValueError(
-                f"basis: x[{max(self.basis.coordinates)}] is none of the {size} states of "
+                f"basis: x[{max(self.coordinates)}] is none of the {size} states of "
                 f"coefficients of shape {shape}"
             )
 
@@ -198,7 +195,7 @@ class Metric:
         largest = np.abs(self.coefficients).max(axis=(1, 2), keepdims=True)
         if np.any(np.abs(self.coefficients - crossed) > _ASYMMETRY * largest):
             raise ValueError("coefficients: every W_i must be symmetric; average it with W_i'")
-        places = places_of(self.region, self.phi, self.point, len(self.scaling), _ANGLES, _PLACES)
+        places = places_of(self.region, self.phi, self.point, len(self.scaling), _POINTS, _PLACES)
         dual = self.dual(places)
         sizes = np.einsum("sii->si", dual)
         worst = int(np.argmin(sizes.min(axis=1)))
@@ -218,15 +215,13 @@ class Metric:
     def _where(self, place: FloatArray) -> str:
         if self.phi == CONSTANT:
             return ""
-        if is_of_the_angle(self.region, self.phi):
-            return f" at the angle {place[ANGLE]:.4g} rad of the region"
         named = ", ".join(f"x[{index}]={place[index]:.4g}" for index in self.coordinates)
         return f" at {named} of the region"
 
     @property
     def phi(self) -> Basis:
         """The functions phi_i."""
-        return self.basis or cosines(ANGLE, len(self.coefficients) - 1)
+        return self.basis or default_basis(self.region, len(self.coefficients) - 1)
 
     @property
     def degree(self) -> int:
@@ -278,6 +273,12 @@ class Metric:
         return replace(self, verification=check)
 
 
+def default_basis(region: MetricRegion, degree: int) -> Basis:
+    """Return the basis of a metric that names none: powers of the cosine of the even coordinate."""
+    even = even_coordinate(region)
+    return CONSTANT if even is None or degree == 0 else cosines(even[0], degree)
+
+
 def metric_place(metric: Any, state: FloatArray, nominal: FloatArray) -> FloatArray:
     """Return what a metric is a function of: x_d where its `point` is "nominal", else x."""
     return nominal if getattr(metric, "point", "state") == "nominal" else state
@@ -301,22 +302,24 @@ def drawn_places(metric: ContractionMetric) -> FloatArray:
 def extreme_eigenvalues(metric: ContractionMetric, points: int = 401) -> tuple[float, float]:
     """Return the extreme eigenvalues of M over its region (observed).
 
-    On the cart-pole's `Region` by a grid of its angles, on every other by a search that begins with
-    random states.
+    Of a metric of the even coordinate of its region by a grid, of every other by a search that
+    begins with random states.
 
     Args:
-        metric: The metric; on a `Region` one that is constant, or of the angle alone.
-        points: Angles from 0 to the region's largest, each with both signs.
+        metric: The metric; on a region that is even in a coordinate a constant one, or one of that
+            coordinate alone.
+        points: Values of that coordinate from 0 to the largest, each with both signs.
 
     Raises:
-        ValueError: The metric depends on more than the angle, or is not positive definite.
+        ValueError: The metric depends on more than that, or is not positive definite.
     """
     check_at_least("points", points, 2)
-    region = metric.region
-    if isinstance(region, Region) and set(getattr(metric, "coordinates", ())) <= {ANGLE}:
-        angles = np.linspace(0.0, region.angle, points)
+    region, even = metric.region, even_coordinate(metric.region)
+    places = getattr(metric, "coordinates", ())
+    if even is not None and set(places) <= {even[0]}:
+        half = np.linspace(0.0, even[1], points)
         values = np.linalg.eigvalsh(
-            np.concatenate([matrices_at(metric, angles), matrices_at(metric, -angles)])
+            np.concatenate([matrices_along(metric, half), matrices_along(metric, -half)])
         )
     else:
         ends = extreme_places(region, metric.dual, getattr(metric, "point", "state"))
@@ -326,35 +329,38 @@ def extreme_eigenvalues(metric: ContractionMetric, points: int = 401) -> tuple[f
     return float(values.min()), float(values.max())
 
 
-def matrices_at(metric: ContractionMetric, angles: FloatArray) -> FloatArray:
-    """Return M at angles (s,), shape (s, n, n), for a metric of nothing but the angle.
+def matrices_along(metric: ContractionMetric, values: FloatArray) -> FloatArray:
+    """Return M at values (s,) of the even coordinate of its region, shape (s, n, n).
 
     Raises:
-        ValueError: At other states with these angles M is another.
+        ValueError: The region has none, or at other states with these values M is another.
     """
     size = len(metric.scaling)
-    states = at_angles(angles, size)
+    if getattr(metric, "coordinates", None) == ():
+        return metric.matrix(np.zeros((len(values), size)))
+    coordinate, _ = even_region(metric)
+    states = along(values, coordinate, size)
     matrix = metric.matrix(states)
     elsewhere = np.random.default_rng(0).uniform(-1.0, 1.0, states.shape)
-    if size > ANGLE:
-        elsewhere[:, ANGLE] = states[:, ANGLE]
+    elsewhere[:, coordinate] = states[:, coordinate]
     if not np.allclose(metric.matrix(elsewhere), matrix, rtol=1e-9, atol=0.0):
         raise ValueError(
-            f"{metric!r} depends on more of the state than the angle x[{ANGLE}]: the angles of its "
-            "region say nothing of its other values"
+            f"{metric!r} depends on more of the state than x[{coordinate}], in which its region is "
+            "even: values of that one say nothing of it elsewhere"
         )
     return matrix
 
 
-def region_angle(metric: ContractionMetric) -> float:
-    """Return the largest angle of a metric's region [rad].
+def even_region(metric: ContractionMetric) -> tuple[int, float]:
+    """Return in which coordinate a metric's region is symmetric, and how far that reaches.
 
     Raises:
-        ValueError: The region is not the cart-pole's.
+        ValueError: It is in none.
     """
-    if not isinstance(metric.region, Region):
+    even = even_coordinate(metric.region)
+    if even is None:
         raise ValueError(
-            f"the metric's region, a {type(metric.region).__name__}, has no angle: this is for "
-            "metrics of the cart-pole, on a Region"
+            f"the metric's region, a {type(metric.region).__name__}, is even in no coordinate: "
+            "this is for metrics of that one alone"
         )
-    return metric.region.angle
+    return even

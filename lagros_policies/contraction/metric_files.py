@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from lagros_envs.checks import check_name, check_positive, shown
 from lagros_envs.files import write_atomic
 from lagros_envs.reading import MOST_TEXT, Record, named, parse_json, read_bytes
-from lagros_envs.tasks.cartpole.physics import ANGLE
-from lagros_policies.contraction.basis import Basis, cosines
-from lagros_policies.contraction.metric import ContractionMetric, Metric, Verification
-from lagros_policies.contraction.regions import BoxRegion, MetricRegion, PlanRegion, Region
+from lagros_policies.contraction.basis import Basis
+from lagros_policies.contraction.metric import (
+    ContractionMetric,
+    Metric,
+    Verification,
+    default_basis,
+)
+from lagros_policies.contraction.regions import BoxRegion, MetricRegion, PlanRegion
+from lagros_policies.tasks import REGIONS
 
-# The first of them is the cart-pole's: W_bar of its angle, on its region.
+# The first of them is of the even coordinate of a region that names no kind.
 _FORMAT = "lagros-metric-1"
 _BASIS = "cos(theta)^i"
 _GENERAL = "lagros-metric-2"
 _NETWORK = ".safetensors"
-# Regions of other systems, by the name in the file.
-_REGIONS: dict[str, type[BoxRegion | PlanRegion]] = {"box": BoxRegion, "plans": PlanRegion}
+# Regions by their kind in a file; those of tasks are in `lagros_policies.tasks`.
+_REGIONS: dict[str, type[Any]] = {"box": BoxRegion, "plans": PlanRegion}
 
 
 def metric_record(metric: Metric) -> dict[str, Any]:
@@ -35,8 +41,9 @@ def metric_record(metric: Metric) -> dict[str, Any]:
     Raises:
         TypeError: Its region is of a class of the caller's own.
     """
-    cosine = cosines(ANGLE, len(metric.coefficients) - 1)
-    plain = metric.point == "state" and metric.phi == cosine and isinstance(metric.region, Region)
+    first = _kind_of(metric.region) == ""
+    degree = len(metric.coefficients) - 1
+    plain = first and metric.point == "state" and metric.phi == default_basis(metric.region, degree)
     kind = (
         {"format": _FORMAT, "basis": _BASIS}
         if plain
@@ -63,16 +70,28 @@ def region_record(region: MetricRegion) -> dict[str, Any]:
     Raises:
         TypeError: It is of a class of the caller's own.
     """
-    if isinstance(region, Region):
-        return asdict(region)
-    for kind, wanted in _REGIONS.items():
-        if type(region) is wanted:
-            arrays = {item.name: getattr(region, item.name) for item in fields(wanted)}
-            return {
-                "kind": kind,
-                **{key: np.asarray(value).tolist() for key, value in arrays.items()},
-            }
-    raise TypeError(f"region={region!r} must be a Region, BoxRegion or PlanRegion to be written")
+    kind = _kind_of(region)
+    if kind is None:
+        raise TypeError(f"region={region!r} must be a BoxRegion, a PlanRegion or that of a task")
+    arrays = {item.name: getattr(region, item.name) for item in fields(cast(Any, region))}
+    plain = {name: np.asarray(value).tolist() for name, value in arrays.items()}
+    return {"kind": kind, **plain} if kind else plain
+
+
+def _kind_of(region: MetricRegion) -> str | None:
+    """Return by which kind a region is written; None for none."""
+    for kind in (*_REGIONS, *REGIONS):
+        if type(region) is _region_class(kind):
+            return kind
+    return None
+
+
+def _region_class(kind: str) -> type[Any]:
+    if kind in _REGIONS:
+        return _REGIONS[kind]
+    module, _, name = REGIONS[kind].partition(":")
+    found: type[Any] = getattr(importlib.import_module(module), name)
+    return found
 
 
 def design_arguments(record: Record) -> dict[str, Any]:
@@ -100,13 +119,15 @@ def design_arguments(record: Record) -> dict[str, Any]:
 
 
 def _region(record: Record) -> MetricRegion:
-    if "kind" not in record.entries:
-        record.only([item.name for item in fields(Region)])
-        return Region(**{item.name: record.number(item.name) for item in fields(Region)})
-    kind = record.text("kind")
-    check_name("kind", kind, _REGIONS)
-    names = [item.name for item in fields(_REGIONS[kind])]
-    record.only(["kind", *names])
+    kind = record.text("kind") if "kind" in record.entries else ""
+    check_name("kind", kind, (*_REGIONS, *REGIONS))
+    wanted = _region_class(kind)
+    names = [item.name for item in fields(wanted)]
+    record.only(["kind", *names] if kind else names)
+    region: MetricRegion
+    if kind not in _REGIONS:
+        region = wanted(**{name: record.number(name) for name in names})
+        return region
     arrays = {name: record.array(name) for name in names}
     if kind == "plans":
         return PlanRegion(**arrays)
@@ -137,11 +158,11 @@ def save_metric(metric: Metric, path: Path | str) -> None:
     write_atomic(path, json.dumps(metric_record(metric), indent=1, allow_nan=False) + "\n")
 
 
-def load_metric(path: Path | str | None = None, states: int | None = None) -> Metric:
+def load_metric(path: Path | str, states: int | None = None) -> Metric:
     """Read a metric.
 
     Args:
-        path: A file written by `save_metric`; None for the shipped cart-pole metric.
+        path: A file written by `save_metric`.
         states: Of how many states it must be; None for any number.
 
     Returns:
@@ -151,15 +172,12 @@ def load_metric(path: Path | str | None = None, states: int | None = None) -> Me
         FileNotFoundError: There is no such file.
         ValueError: The file is not a metric, is a network, is damaged, or of other states.
     """
-    if path is None:
-        path = Path(__file__).parents[1] / "pretrained" / "cartpole_metric.json"
     data = read_bytes(path, MOST_TEXT)
     if Path(path).suffix == _NETWORK or not _is_text(data):
         raise ValueError(
             f"{named(path)} is no JSON: a network is neither read nor proved here, only a "
-            "polynomial is. Give a file of save_metric, as `python -m "
-            "lagros_policies.tasks.cartpole.proof_design --out FILE` writes; for networks there is "
-            "load_neural_metric, and their condition is checked on samples"
+            "polynomial is. Give a file of save_metric; the condition of a network is checked on "
+            "samples"
         )
     record = Record(parse_json(data, named(path), "a metric written by save_metric"), named(path))
     with naming(path):

@@ -1,16 +1,20 @@
-"""The states that stand for what a metric depends on: a grid of angles, or drawn from a region."""
+"""The states that stand for what a metric depends on: on a grid, or drawn from a region."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, TypeGuard
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.tasks.cartpole.physics import ANGLE
 from lagros_policies.contraction.basis import CONSTANT, Basis
-from lagros_policies.contraction.regions import MetricRegion, Region, Samples, search_region
+from lagros_policies.contraction.regions import (
+    MetricRegion,
+    Samples,
+    even_coordinate,
+    search_region,
+)
 
 FloatArray = NDArray[np.float64]
 # Whether W_bar is a function of x or of x_d.
@@ -18,7 +22,7 @@ Point = Literal["state", "nominal"]
 
 
 def places_of(
-    region: MetricRegion, basis: Basis, point: Point, size: int, angles: int, count: int
+    region: MetricRegion, basis: Basis, point: Point, size: int, points: int, count: int
 ) -> FloatArray:
     """Return states that cover what W_bar depends on in a region, shape (s, size).
 
@@ -27,7 +31,7 @@ def places_of(
         basis: phi_i of W_bar.
         point: What they are functions of.
         size: Number n of states.
-        angles: States for a metric of the cart-pole's angle, even in it: angles from 0 on.
+        points: States for a metric that is even in the even coordinate of the region: from 0 on.
         count: States for any other that is not constant, drawn from the region.
 
     Raises:
@@ -35,15 +39,15 @@ def places_of(
     """
     if basis == CONSTANT:
         return np.zeros((1, size))
-    angle = is_of_the_angle(region, basis)
-    drawn = region.sample(np.random.default_rng(0), 1 if angle else count)
+    reach = even_reach(region, basis)
+    drawn = region.sample(np.random.default_rng(0), count if reach is None else 1)
     if drawn.state.shape[1] != size:
         raise ValueError(
             f"region: it is of {drawn.state.shape[1]} states, and the metric is of {size}: give a "
             "BoxRegion or PlanRegion of these"
         )
-    if is_of_the_angle(region, basis):
-        return at_angles(np.linspace(0.0, region.angle, angles), size)
+    if reach is not None:
+        return along(np.linspace(0.0, reach, points), basis.coordinates[0], size)
     return drawn.nominal if point == "nominal" else drawn.state
 
 
@@ -72,19 +76,19 @@ def extreme_places(
     return found
 
 
-def at_angles(angles: FloatArray, size: int) -> FloatArray:
-    """Return states (..., size) at angles (...), zero but for the angle where there is one."""
-    states = np.zeros((*np.shape(angles), size))
-    if size > ANGLE:
-        states[..., ANGLE] = angles
+def along(values: FloatArray, coordinate: int, size: int) -> FloatArray:
+    """Return states (..., size) that are zero but for the values (...) of one coordinate."""
+    states = np.zeros((*np.shape(values), size))
+    states[..., coordinate] = values
     return states
 
 
 def is_on_grid(region: MetricRegion, basis: Basis) -> bool:
     """Return whether `places_of` covers a region without drawing from it."""
-    return basis == CONSTANT or is_of_the_angle(region, basis)
+    return basis == CONSTANT or even_reach(region, basis) is not None
 
 
-def is_of_the_angle(region: MetricRegion, basis: Basis) -> TypeGuard[Region]:
-    """Return whether W_bar is a polynomial of cos(theta) on the cart-pole's region."""
-    return isinstance(region, Region) and basis.cosine == ANGLE
+def even_reach(region: MetricRegion, basis: Basis) -> float | None:
+    """Return how far the even coordinate reaches of which W_bar is a polynomial of the cosine."""
+    even = even_coordinate(region)
+    return None if even is None or basis.cosine != even[0] else even[1]

@@ -1,26 +1,28 @@
 """Where a metric is claimed to contract: sets of triples (x, x_d, u_d), drawn from and asked about.
 
-`Region` is the cart-pole's, `BoxRegion` that of any system, and `PlanRegion` surrounds given plans,
-on which control and state go together as they do not in a box.
+`BoxRegion` bounds every coordinate; `PlanRegion` surrounds given plans, on which control and state
+go together as they do not in a box. A region of one's own may also say, in `even`, in which
+coordinate it is symmetric about zero and how far that reaches: a metric of that one alone, even in
+it, is then looked at on a grid; and in `scaling` in which units a condition number is measured.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_fields, check_positive, check_whole
-from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE
+from lagros_envs.aliases import moved_names
+from lagros_envs.checks import check_fields, check_positive, check_whole, is_number, shown
 
+__getattr__ = moved_names(__name__)
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+Numbers = tuple[float, ...]
 
-_STATES = 4  # of the cart-pole: [p, theta, dp/dt, dtheta/dt]
 # Triples that the search for a maximum begins with, follows, and tries around each.
 _BEGIN = 4000
 _FOLLOWED = 8
@@ -76,6 +78,12 @@ def joined(*parts: Samples) -> Samples:
     )
 
 
+def even_coordinate(region: Any) -> tuple[int, float] | None:
+    """Return in which coordinate a region is symmetric, and how far that reaches; None for none."""
+    found: tuple[int, float] | None = getattr(region, "even", None)
+    return found
+
+
 class MetricRegion(Protocol):
     """The triples (x, x_d, u_d) for which a metric is designed and checked."""
 
@@ -89,84 +97,10 @@ class MetricRegion(Protocol):
 
 
 @dataclass(frozen=True)
-class Region:
-    """The states and errors for which a cart-pole metric was designed and checked.
-
-    The check draws triples (x, x_d, u_d) around plans and keeps those that lie within these bounds.
-    On a plan the force goes with the angle, so that this covers a part of the bounds only: taken as
-    a box of independent numbers they hold states at which the shipped metric fails. `prove` says
-    what holds on a whole box. Neither the metric nor its condition depends on the position, and
-    that of x_d's speed is bounded by the plans alone.
-
-    Attributes:
-        angle: Largest |theta| of x and of x_d [rad].
-        angular_rate: Largest |dtheta/dt| of x and of x_d [rad/s].
-        angle_error: Largest |theta - theta_d| [rad].
-        angular_rate_error: Largest error of the rate [rad/s].
-        force: Largest |u_d| [N].
-
-    Raises:
-        ValueError: A bound is not positive, or the angle reaches pi/2.
-    """
-
-    angle: float = 1.15
-    angular_rate: float = 4.0
-    angle_error: float = 0.35
-    angular_rate_error: float = 2.0
-    force: float = 40.0
-
-    def __post_init__(self) -> None:
-        """Check the bounds."""
-        for item in fields(self):
-            check_positive(item.name, getattr(self, item.name))
-        if self.angle >= math.pi / 2:
-            raise ValueError(
-                f"angle={self.angle!r} must be below pi/2, where the force loses its authority"
-            )
-
-    def sample(self, rng: np.random.Generator, count: int) -> Samples:
-        """Draw triples within the bounds, positions and speeds within 1 m and 1 m/s.
-
-        They are independent of each other: plans are not asked, see above.
-        """
-        error, rate = self.angle_error, self.angular_rate_error
-        box = BoxRegion(
-            low=(-1.0, -self.angle, -1.0, -self.angular_rate),
-            high=(1.0, self.angle, 1.0, self.angular_rate),
-            error=(1.0, error, 1.0, rate),
-            control_low=(-self.force,),
-            control_high=(self.force,),
-        )
-        return box.sample(rng, count)
-
-    def contains(
-        self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
-    ) -> BoolArray:
-        """Return which triples (x, x_d, u_d) of a batch (..., 4), (..., 4), (..., 1) lie inside.
-
-        Raises:
-            ValueError: They are not of the cart-pole's four states and one control.
-        """
-        shapes = [np.shape(part)[-1:] for part in (state, nominal, nominal_control)]
-        if shapes != [(_STATES,), (_STATES,), (1,)]:
-            raise ValueError(
-                f"states and control end in {shapes}: a Region bounds the cart-pole's four states "
-                "[p, theta, dp/dt, dtheta/dt] and one force; for other systems there are BoxRegion "
-                "and PlanRegion"
-            )
-        error = np.abs(state - nominal)
-        inside = np.abs(nominal_control[..., 0]) <= self.force
-        for point in (state, nominal):
-            inside &= np.abs(point[..., ANGLE]) <= self.angle
-            inside &= np.abs(point[..., ANGULAR_RATE]) <= self.angular_rate
-        inside &= error[..., ANGLE] <= self.angle_error
-        inside &= error[..., ANGULAR_RATE] <= self.angular_rate_error
-        return inside
-
-
-@dataclass(frozen=True)
 class BoxRegion:
     """Bounds of every coordinate of x and x_d, of their difference, and of every control.
+
+    An infinite bound leaves a coordinate free; it is drawn within one unit then.
 
     Attributes:
         low: Lower bounds of x and x_d, one per state.
@@ -179,15 +113,20 @@ class BoxRegion:
         ValueError: The lengths differ, or a lower bound is not below its upper bound.
     """
 
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    error: tuple[float, ...]
+    low: Sequence[float]
+    high: Sequence[float]
+    error: Sequence[float]
     control_low: tuple[float, ...]
     control_high: tuple[float, ...]
 
     def __post_init__(self) -> None:
         """Check the bounds."""
         check_fields(self)
+        for name in ("low", "high", "error"):
+            value = getattr(self, name)
+            numbers = isinstance(value, tuple) and all(is_number(one) for one in value)
+            if not numbers or np.any(np.isnan(value)):
+                raise ValueError(f"{name}={shown(value)} must be a tuple, each entry a number")
         pairs = {"low": "high", "control_low": "control_high", "error": "low"}
         for one, other in pairs.items():
             if len(getattr(self, one)) != len(getattr(self, other)) or not getattr(self, one):
@@ -200,13 +139,31 @@ class BoxRegion:
                 raise ValueError(
                     f"{one}={getattr(self, one)!r} must be below {other}={getattr(self, other)!r}"
                 )
+        if np.any(np.isfinite(self.low) != np.isfinite(self.high)):
+            raise ValueError(f"low={self.low!r} must be infinite where high={self.high!r} is")
         for value in self.error:
-            check_positive("error", value)
+            if value != np.inf:
+                check_positive("error", value)
+
+    def scaled(self, factor: float) -> BoxRegion:
+        """Return the box with its sizes about the same middle, and its errors, times a factor."""
+
+        def ends(low: Sequence[float], high: Sequence[float]) -> list[Numbers]:
+            sides = np.array([low, high])
+            middle = np.where(np.isfinite(sides).all(axis=0), sides, 0.0).mean(axis=0)
+            return [tuple(side.tolist()) for side in middle + factor * (sides - middle)]
+
+        low, high = ends(self.low, self.high)
+        error = tuple(factor * value for value in self.error)
+        return BoxRegion(low, high, error, *ends(self.control_low, self.control_high))
 
     def sample(self, rng: np.random.Generator, count: int) -> Samples:
         """Draw triples: x_d and u_d uniform in their bounds, x in what the error leaves of them."""
         check_whole("count", count)
-        low, high, error = map(np.array, (self.low, self.high, self.error))
+        low, high, error = (
+            np.where(np.isfinite(end), end, unit)
+            for end, unit in ((self.low, -1.0), (self.high, 1.0), (self.error, 1.0))
+        )
         nominal = rng.uniform(low, high, (count, len(low)))
         state = rng.uniform(np.maximum(low, nominal - error), np.minimum(high, nominal + error))
         control = rng.uniform(self.control_low, self.control_high, (count, len(self.control_low)))
@@ -364,7 +321,7 @@ def _moved(found: Samples, moves: FloatArray) -> Samples:
     )
 
 
-def _within(point: FloatArray, low: tuple[float, ...], high: tuple[float, ...]) -> BoolArray:
+def _within(point: FloatArray, low: Sequence[float], high: Sequence[float]) -> BoolArray:
     inside: BoolArray = np.all((point >= low) & (point <= high), axis=-1)
     return inside
 

@@ -4,9 +4,9 @@ The true system is the model with an unknown force on the same channel as the co
 
     dx/dt = f(x) + B(x) (u + Y(x, u) a),    a constant and unknown, Y known (1 x k),
 
-which is what a wrong friction of the cart, a wrong mass of the cart or a slope of the track come to
-for the cart-pole. The law of Tsukamoto, Chung and Slotine (aNCM, 2021) is u = u* - Y a_hat with
-da_hat/dt = Gamma Y'B'M e - sigma a_hat. Under a control held for h it reads here
+which is what a wrong friction, a wrong mass or a slope of the ground come to. The law of
+Tsukamoto, Chung and Slotine (aNCM, 2021) is u = u* - Y a_hat with da_hat/dt =
+Gamma Y'B'M e - sigma a_hat. Under a control held for h it reads here
 
     u[k] = u*[k] - Y[k] a_hat[k]
     a_hat[k+1] = (1 - h sigma) a_hat[k] + Gamma Y[k]' G[k]' M(x[k+1]) e[k+1],    G = dF/du,
@@ -30,52 +30,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import System, hold_control_slope, vector_field
-from lagros_envs.tasks.cartpole.physics import VELOCITY
+from lagros_envs.aliases import moved_names
+from lagros_envs.dynamics import hold_control_slope
 from lagros_policies.contraction.control import HeldControl
-from lagros_policies.contraction.metric import matrices_at, region_angle
-from lagros_policies.contraction.places import at_angles
-from lagros_policies.tasks.cartpole.systems import check_cartpole
+from lagros_policies.contraction.metric import matrices_along, metric_place
+from lagros_policies.contraction.places import along
+from lagros_policies.contraction.regions import even_coordinate
 
+__getattr__ = moved_names(__name__)
 FloatArray = NDArray[np.float64]
-# (x (..., n), u (..., 1)) -> Y (..., k) [N per unit of a].
+# (x (..., n), u (..., 1)) -> Y (..., k), in units of the control per unit of a.
 Regressor = Callable[[FloatArray, FloatArray], FloatArray]
 
 _GRID = 41
-
-
-def friction_regressor(state: FloatArray, control: FloatArray) -> FloatArray:
-    """Return Y = -dp/dt, shape (..., 1): a is the true friction less the model's [N s/m].
-
-    Raises:
-        ValueError: The states are not of the cart-pole's four.
-    """
-    if np.shape(state)[-1:] != (4,):
-        raise ValueError(f"state of shape {np.shape(state)} must be the cart-pole's, (..., 4)")
-    return -state[..., VELOCITY, None]
-
-
-def slope_regressor(state: FloatArray, control: FloatArray) -> FloatArray:
-    """Return Y = 1, shape (..., 1): a is a constant force [N], as of a track that is not level."""
-    return np.ones((*state.shape[:-1], 1))
-
-
-def cart_mass_regressor(model: System) -> Regressor:
-    """Return Y = -d2p/dt2 of the model: a is the true mass of the cart less the model's [kg].
-
-    The equation of the cart reads (m_c + m) d2p/dt2 + ... = u, so that more mass is a force against
-    the acceleration. Y takes the model's acceleration for the true one, which is right to first
-    order in a.
-
-    Raises:
-        TypeError: The model is no cart-pole.
-    """
-    check_cartpole(model, "cart_mass_regressor")
-
-    def regressor(state: FloatArray, control: FloatArray) -> FloatArray:
-        return -vector_field(model, state, control)[..., VELOCITY, None]
-
-    return regressor
+_DRAWN = 1000
 
 
 @dataclass(frozen=True)
@@ -129,13 +97,13 @@ class AdaptiveControl:
             preferred: As in `HeldControl`, shape (...).
 
         Returns:
-            u = u* - Y a_hat and u*, both of shape (..., 1) [N].
+            u = u* - Y a_hat and u*, both of shape (..., 1).
         """
         wanted = self.law(state, nominal, nominal_control, preferred)
         return self.corrected(state, wanted, estimate), wanted
 
     def corrected(self, state: FloatArray, wanted: FloatArray, estimate: FloatArray) -> FloatArray:
-        """Return u = u* - Y a_hat, shape (..., 1) [N].
+        """Return u = u* - Y a_hat, shape (..., 1).
 
         Args:
             state: x, shape (..., n).
@@ -178,24 +146,36 @@ def largest_gain(
 ) -> tuple[float, ...]:
     """Return the diagonal of Gamma for which kappa is a share of 1 - exp(-2 alpha h).
 
+    G'MG is looked for on a grid of the even coordinate of the metric's region, for u = 0, or at
+    states and controls drawn from it (observed).
+
     Args:
-        law: u* of the cart-pole.
-        reach: Largest |Y| of each unknown in the region of interest [N per unit].
+        law: u* of a system with one control.
+        reach: Largest |Y| of each unknown in the region of interest, in units of the control.
         share: Share of the limit, in (0, 1); split evenly between the unknowns.
 
     Returns:
         One number per unknown, in units of a^2 over those of V.
 
     Raises:
-        TypeError: The law is not that of a cart-pole.
-        ValueError: A reach or the share is out of range.
+        ValueError: The system has several controls, or a reach or the share is out of range.
     """
     if not reach or not min(reach) > 0.0 or not 0.0 < share < 1.0:
         raise ValueError(f"{reach=!r} must be > 0 and {share=!r} in (0, 1)")
-    check_cartpole(law.system, "largest_gain")
-    angles = np.linspace(0.0, region_angle(law.metric), _GRID)
-    states = at_angles(angles, law.system.state_dim)
-    _, push = hold_control_slope(law.system, states, np.zeros((_GRID, 1)), law.period)
-    stiffness = np.einsum("si,sij,sj->s", push, matrices_at(law.metric, angles), push).max()
+    if law.system.control_dim != 1:
+        raise ValueError(
+            f"{law.system!r} has {law.system.control_dim} controls: largest_gain is for one"
+        )
+    even = even_coordinate(law.metric.region)
+    if even is None:
+        drawn = law.metric.region.sample(np.random.default_rng(0), _DRAWN)
+        states, control = drawn.state, drawn.nominal_control
+        matrix = law.metric.matrix(metric_place(law.metric, states, drawn.nominal))
+    else:
+        values = np.linspace(0.0, even[1], _GRID)
+        states, control = along(values, even[0], law.system.state_dim), np.zeros((_GRID, 1))
+        matrix = matrices_along(law.metric, values)
+    _, push = hold_control_slope(law.system, states, control, law.period)
+    stiffness = np.einsum("si,sij,sj->s", push, matrix, push).max()
     kappa = share * -math.expm1(-2.0 * law.rate * law.period)
     return tuple(kappa / (len(reach) * y * y * float(stiffness)) for y in reach)

@@ -2,18 +2,18 @@
 
 The state obeys dx = (f + B u) dt + G dw with a Wiener process w and G = diag(g), g the intensity of
 each channel [unit of the state / sqrt(s)]. No bound holds for every path, but for V = e'M(x)e Ito's
-formula adds to dV/dt <= -2 alpha V the power that the noise feeds in. For a metric of the angle
+formula adds to dV/dt <= -2 alpha V the power that the noise feeds in. For a metric of one x_i
 
-    L V <= -2 alpha V + tr(G'MG) + g_theta^2 (2 (M_theta e)_theta + e'M_theta_theta e / 2),
+    L V <= -2 alpha V + tr(G'MG) + g_i^2 (2 (M_i e)_i + e'M_ii e / 2),    M_i = dM/dx_i,
 
-and with ||M_theta i_theta|| <= mu_1 in the norm of M^-1, e'M_theta_theta e <= mu_2 V and
+and with ||column i of M_i|| <= mu_1 in the norm of M^-1, e'M_ii e <= mu_2 V and
 2 mu_1 sqrt(V) <= mu_1^2 / eps + eps V, for any eps > 0,
 
     E V(t) <= e^(-2 a t) V(0) + C / (2 a) (1 - e^(-2 a t)),    E||e||^2 <= E V / lambda_min(M),
-    a = alpha - g_theta^2 (eps + mu_2 / 2) / 2,    C = sup tr(G'MG) + g_theta^2 mu_1^2 / eps.
+    a = alpha - g_i^2 (eps + mu_2 / 2) / 2,    C = sup tr(G'MG) + g_i^2 mu_1^2 / eps.
 
 This is the theorem of Tsukamoto, Chung and Slotine (NSCM, 2021) in the norm of the metric itself.
-Noise that enters as accelerations (g_theta = 0) needs no correction.
+Noise that enters as accelerations (g_i = 0) needs no correction.
 """
 
 from __future__ import annotations
@@ -27,23 +27,22 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import check_at_least, check_not_negative, check_positive
 from lagros_envs.dynamics import System, hold_step
-from lagros_envs.tasks.cartpole.physics import ANGLE
 from lagros_policies.contraction.double_integrator import AxisMetric
 from lagros_policies.contraction.metric import (
     ContractionMetric,
     drawn_places,
-    matrices_at,
+    even_region,
+    matrices_along,
     metric_is_still,
-    region_angle,
 )
-from lagros_policies.contraction.places import at_angles
+from lagros_policies.contraction.places import along
 
 FloatArray = NDArray[np.float64]
 
 _GRID = 401
 # Shares of alpha that eps may take; the best of them is used.
 _SHARES = np.geomspace(1e-3, 1.9, 200)
-_ANGLE_STEP = 1e-4  # [rad], of the second derivative of M
+_STEP = 1e-4  # of the second derivative of M
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,14 +97,14 @@ def checked_intensity(intensity: Any, size: int) -> FloatArray:
 def mean_square_bound(
     metric: ContractionMetric, intensity: Any, initial_energy: float = 0.0
 ) -> MeanSquareBound:
-    """Return the bound for a metric that noise moves by the angle alone, for a control at will.
+    """Return the bound for a metric that noise moves by one coordinate, for a control at will.
 
-    The suprema are taken over a grid of the region's angles, or over states drawn from it
+    The suprema are taken over a grid of that coordinate, or over states drawn from it
     (observed), and the bound holds while the state stays in the region: noise leaves any region at
     some time, if rarely.
 
     Args:
-        metric: A metric that is constant, of x_d, or of the cart-pole's angle alone.
+        metric: A metric that is constant, of x_d, or of the even coordinate of its region alone.
         intensity: g, shape (n,) [unit of the state / sqrt(s)].
         initial_energy: V(0).
 
@@ -113,53 +112,53 @@ def mean_square_bound(
         The bound, with the eps that makes the steady value least.
 
     Raises:
-        ValueError: The noise of the angle is too strong for the metric's rate, the metric depends
-            on more than the angle, or a number is out of range.
+        ValueError: The noise of the coordinate is too strong for the metric's rate, the metric
+            depends on more than the coordinate, or a number is out of range.
     """
     size = len(metric.scaling)
     squares = checked_intensity(intensity, size) ** 2
     check_not_negative("initial_energy", initial_energy)
     still = metric_is_still(metric)
+    coordinate = 0
     if still:
         matrix = metric.matrix(drawn_places(metric))
     else:
-        angle = region_angle(metric)
-        angles = np.linspace(-angle, angle, _GRID)
-        matrix = matrices_at(metric, angles)
+        coordinate, reach = even_region(metric)
+        values = np.linspace(-reach, reach, _GRID)
+        matrix = matrices_along(metric, values)
     power = float(np.max(np.einsum("sii,i->s", matrix, squares)))
     least = float(np.linalg.eigvalsh(matrix)[:, 0].min())
-    angle_power = float(squares[ANGLE]) if size > ANGLE else 0.0
-    if still or angle_power == 0.0:
+    moving = 0.0 if still else float(squares[coordinate])
+    if moving == 0.0:
         return MeanSquareBound(metric.contraction_rate, power, least, initial_energy)
-    first, second = _variation(metric, angles, matrix)
-    eps = _SHARES * metric.contraction_rate / angle_power
-    rates = metric.contraction_rate - 0.5 * angle_power * (eps + 0.5 * second)
-    powers = power + angle_power * first**2 / eps
+    first, second = _variation(metric, values, matrix)
+    eps = _SHARES * metric.contraction_rate / moving
+    rates = metric.contraction_rate - 0.5 * moving * (eps + 0.5 * second)
+    powers = power + moving * first**2 / eps
     steady = np.where(rates > 0.0, powers / np.where(rates > 0.0, rates, 1.0), np.inf)
     best = int(np.argmin(steady))
     if not np.isfinite(steady[best]):
         raise ValueError(
-            f"intensity={intensity!r}: the noise of the angle takes more than the whole rate "
+            f"intensity={intensity!r}: the noise of x[{coordinate}] takes more than the whole rate "
             f"alpha={metric.contraction_rate!r}; the mean square has no bound by this metric"
         )
     return MeanSquareBound(float(rates[best]), float(powers[best]), least, initial_energy)
 
 
 def _variation(
-    metric: ContractionMetric, angles: FloatArray, matrix: FloatArray
+    metric: ContractionMetric, values: FloatArray, matrix: FloatArray
 ) -> tuple[float, float]:
-    """Return mu_1 and mu_2 over the grid."""
-    states = at_angles(angles, len(metric.scaling))
-    turn = at_angles(np.ones(len(angles)), len(metric.scaling))  # at 1 rad/s
+    """Return mu_1 and mu_2 over a grid of the coordinate that the metric depends on."""
+    (coordinate, _), size = even_region(metric), len(metric.scaling)
+    states = along(values, coordinate, size)
+    turn = along(np.ones(len(values)), coordinate, size)  # at one unit per second
     slope = metric.matrix_rate(states, turn)
     ahead, behind = states.copy(), states.copy()
-    ahead[:, ANGLE] += _ANGLE_STEP
-    behind[:, ANGLE] -= _ANGLE_STEP
-    curvature = (metric.matrix_rate(ahead, turn) - metric.matrix_rate(behind, turn)) / (
-        2.0 * _ANGLE_STEP
-    )
+    ahead[:, coordinate] += _STEP
+    behind[:, coordinate] -= _STEP
+    curvature = (metric.matrix_rate(ahead, turn) - metric.matrix_rate(behind, turn)) / (2.0 * _STEP)
     inverse = np.linalg.inv(matrix)
-    column = slope[:, :, ANGLE]
+    column = slope[:, :, coordinate]
     first = np.sqrt(np.einsum("si,sij,sj->s", column, inverse, column))
     second = np.linalg.eigvals(inverse @ curvature).real.max()
     return float(first.max()), max(float(second), 0.0)

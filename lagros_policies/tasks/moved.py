@@ -37,8 +37,9 @@ _MOVED = {
     "contraction.adaptive": "remarks.adaptive",
     "contraction.lagrangian": "remarks.lagrangian",
     "contraction.stochastic": "remarks.stochastic",
-    "contraction.neural": "remarks.neural",
-    "options": "remarks.policies",
+    "contraction.neural": "tasks.cartpole.neural",
+    "options": "tasks.cartpole.remarks",
+    "remarks.policies": "tasks.cartpole.remarks",
     "imitation.features": "tasks.cartpole.features",
     "imitation.spacecraft_features": "tasks.spacecraft.features",
     "imitation.spacecraft_flights": "tasks.spacecraft.flights",
@@ -55,6 +56,8 @@ NAMES = {
     "lagros_policies.policy": {"SPACECRAFT_NAMES": "lagros_policies.tasks.spacecraft"},
     "lagros_policies.expert": "lagros_policies.tasks.cartpole.expert",
     "lagros_policies.safety": "lagros_policies.tasks.spacecraft.safety_filter",
+    "lagros_policies.contraction": {"Region": f"{_CARTPOLE}.region"},
+    "lagros_policies.contraction.regions": {"Region": f"{_CARTPOLE}.region"},
     "lagros_policies.contraction.tube_design": {"PlanBox": f"{_CARTPOLE}.plans"},
     "lagros_policies.contraction.held_ellipsoid": {"held_statement": f"{_CARTPOLE}.certificate"},
     "lagros_policies.contraction.theorems": {
@@ -62,7 +65,8 @@ NAMES = {
         "Lipschitz": f"{_CARTPOLE}.lipschitz",
         "metric_drift": "lagros_policies.proof.bounds",
     },
-    "lagros_policies.remarks.policies": {
+    "lagros_policies.remarks.adaptive": f"{_CARTPOLE}.remarks",
+    "lagros_policies.tasks.cartpole.remarks": {
         "SlidingCentralizedPolicy": "lagros_policies.tasks.spacecraft.sliding",
     },
     "lagros_policies.remarks.lagrangian": {

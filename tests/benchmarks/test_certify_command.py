@@ -16,10 +16,11 @@ from lagros_benchmarks.evidence.single import fly_kinds, met_error, tube_line
 from lagros_benchmarks.tasks.cartpole import certify as certify_box
 from lagros_benchmarks.tasks.spacecraft.certify import AXIS_FORMAT
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
-from lagros_policies.contraction import load_metric, save_metric
+from lagros_policies.contraction import save_metric
 from lagros_policies.contraction.certificate import Certificate, TubeSizes
 from lagros_policies.contraction.metric_files import metric_record
 from lagros_policies.contraction.statement import Statement
+from lagros_policies.expert import metric_of
 from lagros_policies.tasks.cartpole.box import ProofBox
 from lagros_policies.tasks.spacecraft.ellipsoid_axis import AxisEllipsoid, prove_axis_ellipsoid
 
@@ -64,11 +65,11 @@ def test_u_star_itself_has_no_learning_error(invoke, tmp_path):
 
 @pytest.mark.usefixtures("quick")
 def test_the_cartpole_is_certified_and_a_planted_bad_metric_is_not(invoke, tmp_path):
-    save_metric(load_metric(), "good.json")
+    save_metric(metric_of(CartPoleSettings()), "good.json")
     result = invoke("cartpole", "--metric", "good.json", "--episodes", "0", "--json", "cp.json")
     assert result.exit_code == 0, result.output
     assert "proved" in result.stdout
-    metric = load_metric()
+    metric = metric_of(CartPoleSettings())
     for name, bad in (
         ("fast", replace(metric, contraction_rate=2.0)),
         ("weak", replace(metric, control_weight=1e-9)),
@@ -131,7 +132,7 @@ def test_a_file_that_is_no_metric_gives_status_one_and_no_traceback(
 
 
 def spoiled_metric(**changes):
-    return {**metric_record(load_metric()), **changes}
+    return {**metric_record(metric_of(CartPoleSettings())), **changes}
 
 
 _EYE = np.eye(4).tolist()
@@ -229,7 +230,7 @@ def test_the_largest_multiple_of_a_box_is_found(monkeypatch):
                 Proof(factor, limit),
             ),
         )
-        box, lines = certify_box.largest_proofs(load_metric(), 1.0)
+        box, lines = certify_box.largest_proofs(metric_of(CartPoleSettings()), 1.0)
         assert f"{box:g}" == box_is
         assert all(line.holds for line in lines)
         assert f"is {box_is} times" in lines[-1].text
@@ -237,7 +238,7 @@ def test_the_largest_multiple_of_a_box_is_found(monkeypatch):
     monkeypatch.setattr(
         certify_box, "prove_multiple", lambda *_: (1.0, Proof(1.0, 0.0), Proof(1.0, 0.0))
     )
-    box, lines = certify_box.largest_proofs(load_metric(), 1.0)
+    box, lines = certify_box.largest_proofs(metric_of(CartPoleSettings()), 1.0)
     assert box == 1.0
     assert not any(line.holds for line in lines)
 
@@ -293,7 +294,7 @@ def test_flights_add_what_was_observed(system_of_task):
     assert flights.states.shape == (12, 91, 4)
     box = ProofBox(0.5, 9.0, 3.0, 9.0, 0.3, 2.0)
     inside = certify_box.instants_in(box, flights)
-    error, line = met_error(CartPoleSettings(), flights, load_metric(), inside)
+    error, line = met_error(CartPoleSettings(), flights, metric_of(CartPoleSettings()), inside)
     assert 0.0 <= error < np.inf
     assert line.kind == "observed"
     line, largest = tube_line(flights, "lagros", 0.3)

@@ -175,7 +175,7 @@ def test_a_search_for_the_share_of_the_certificate_is_no_worse_than_its_starts(
 
 
 def test_a_metric_that_is_a_network_is_attacked_by_the_law_of_its_own() -> None:
-    name = "lagros_policies.remarks.policies:NeuralTubeMpcPolicy"
+    name = "lagros_policies.tasks.cartpole.remarks:NeuralTubeMpcPolicy"
     given = AttackSettings(
         "cartpole", policy=name, bound=0.3, episodes=1, search=SearchSettings(budget=30)
     )

@@ -75,7 +75,7 @@ def test_modules_of_a_package_that_has_moved_are_not_imported_twice():
         ("lagros_envs.dynamics", "Spacecraft", "lagros_envs.tasks.spacecraft.physics"),
         ("lagros_policies.expert", "CartPoleExpert", "lagros_policies.tasks.cartpole.expert"),
         ("lagros_policies.safety", "SafetyFilter", FILTER),
-        ("lagros_policies.remarks.policies", "SlidingCentralizedPolicy", SLIDING),
+        ("lagros_policies.tasks.cartpole.remarks", "SlidingCentralizedPolicy", SLIDING),
         ("lagros_policies.remarks.lagrangian", "SlidingTracking", SLIDING),
         ("lagros_benchmarks.report", "print_report", "lagros_benchmarks.report.delivery"),
     ],

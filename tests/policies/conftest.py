@@ -12,9 +12,10 @@ import pytest
 
 from lagros_envs.tasks.cartpole import task
 from lagros_envs.tasks.cartpole.physics import CartPole
-from lagros_policies.contraction import CvStemSettings, Region, Samples, design_on_pool
+from lagros_policies.contraction import CvStemSettings, Samples, design_on_pool
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.tasks.cartpole.planner import CartPolePlanner
+from lagros_policies.tasks.cartpole.region import Region
 
 ROOT = Path(__file__).resolve().parents[2]
 PERIOD = 0.1

@@ -9,23 +9,26 @@ from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.tasks.cartpole import task
 from lagros_envs.tasks.cartpole.physics import CartPole
-from lagros_policies.contraction import HeldControl, load_metric
+from lagros_policies.contraction import HeldControl
 from lagros_policies.contraction.control import error_energy
 from lagros_policies.remarks.adaptive import (
     AdaptiveControl,
-    cart_mass_regressor,
-    friction_regressor,
     largest_gain,
-    slope_regressor,
 )
 from lagros_policies.tasks.cartpole.planner import CartPolePlanner
+from lagros_policies.tasks.cartpole.remarks import (
+    cart_mass_regressor,
+    friction_regressor,
+    slope_regressor,
+)
+from tests.policies.shipped import shipped_metric
 
 PERIOD, MODEL = 0.1, CartPole()
 
 
 @pytest.fixture(scope="module")
 def law():
-    metric = load_metric()
+    metric = shipped_metric()
     return HeldControl(MODEL, metric, metric.contraction_rate, PERIOD)
 
 

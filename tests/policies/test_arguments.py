@@ -15,8 +15,8 @@ from lagros_policies.contraction import load_metric
 from lagros_policies.learning.deep_set import DeepSet
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.policy import _places
-from lagros_policies.remarks.neural.metric import load_neural_metric
 from lagros_policies.sb3_model import load_stable_baselines3
+from lagros_policies.tasks.cartpole.neural.metric import load_neural_metric
 from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 from tests.policies.test_objects import CARTPOLE, SLIDING, SPACECRAFT, world
 

@@ -9,7 +9,6 @@ import pytest
 
 from lagros_envs.dynamics import jacobian
 from lagros_envs.tasks.spacecraft.physics import Spacecraft
-from lagros_policies.contraction import Region, load_metric
 from lagros_policies.contraction.double_integrator import design_axis
 from lagros_policies.contraction.statement import Statement
 from lagros_policies.tasks.cartpole.box import ProofBox
@@ -18,8 +17,10 @@ from lagros_policies.tasks.cartpole.certificate import (
     cartpole_certificate,
     region_of,
 )
+from lagros_policies.tasks.cartpole.region import Region
 from lagros_policies.tasks.spacecraft import certificate as certificate_spacecraft
 from lagros_policies.tasks.spacecraft.certificate import spacecraft_certificate
+from tests.policies.shipped import shipped_metric
 
 BOX = ProofBox(0.06, 0.3, 0.3, 0.3, angle_error=0.03, angular_rate_error=0.1)
 KEYS = {
@@ -31,7 +32,7 @@ KEYS = {
 @pytest.fixture(scope="module")
 def cartpole(system):
     question = CartPoleQuestion(BOX, 0.3, 0.2, 3.15)
-    return cartpole_certificate(system, load_metric(), question)
+    return cartpole_certificate(system, shipped_metric(), question)
 
 
 def spacecraft_of_task():
@@ -103,7 +104,7 @@ def test_an_outsider_rebuilds_the_metric_and_finds_every_claim_true(cartpole, or
 def test_a_disturbance_too_large_for_the_metric_leaves_a_tube_of_the_rates(system, cartpole):
     large = 2.1 * cartpole.alpha / cartpole.details["drift"]
     found = cartpole_certificate(
-        system, load_metric(), CartPoleQuestion(BOX, large, 0.0, 3.15), proofs=[]
+        system, shipped_metric(), CartPoleQuestion(BOX, large, 0.0, 3.15), proofs=[]
     )
     assert found.channels == "rates"
     assert found.tube.certified == pytest.approx(large / found.alpha * math.sqrt(found.chi))
@@ -128,7 +129,7 @@ def thin(metric):
 )
 def test_the_certificate_of_a_bad_metric_does_not_hold(system, spoil):
     question = CartPoleQuestion(BOX, 0.05, 0.0, 3.15, most_seconds=10.0)
-    found = cartpole_certificate(system, spoil(load_metric()), question)
+    found = cartpole_certificate(system, spoil(shipped_metric()), question)
     assert not found.holds
     json.dumps(found.as_json(), allow_nan=False)
 

@@ -12,9 +12,10 @@ import pytest
 
 from lagros_envs.tasks.cartpole import task
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
-from lagros_policies.contraction import Region, save_metric
+from lagros_policies.contraction import save_metric
 from lagros_policies.learning.dataset import ExpertDataSettings, generate
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
+from lagros_policies.tasks.cartpole.region import Region
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = ExpertDataSettings(plans=8, samples=160, shards=4, disturbance_bound=0.8, seed=5)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BPoly
 
-from lagros_policies.contraction import held_ellipsoid, load_metric
+from lagros_policies.contraction import held_ellipsoid
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.held_design import (
     HeldDesign,
@@ -27,6 +27,7 @@ from lagros_policies.tasks.cartpole.certificate import (
     held_statement,
 )
 from lagros_policies.tasks.cartpole.plans import PlanBox
+from tests.policies.shipped import shipped_metric
 
 PLAN = PlanBox(angle=0.05, velocity=0.3, angular_rate=0.1, force=0.3)
 BOUND, PERIOD = 0.1, 0.1
@@ -240,7 +241,7 @@ def test_values_out_of_range_are_refused(change, match):
 @pytest.mark.parametrize("tube", [False], indirect=True, ids=["periodic"])
 def test_a_certificate_carries_the_tube_and_an_outsider_finds_it_kept(system, tube, oracle):
     question = CartPoleQuestion(ProofBox(0.06, 0.3, 0.3, 0.3), BOUND, 0.0, 3.15)
-    found = cartpole_certificate(system, load_metric(), question, proofs=[], held=[tube])
+    found = cartpole_certificate(system, shipped_metric(), question, proofs=[], held=[tube])
     assert found.holds
     record = json.loads(json.dumps(found.as_json(), allow_nan=False))["held_tubes"][0]
     coefficients, gain = np.array(record["Q"]), np.array(record["K"])
@@ -257,5 +258,5 @@ def test_a_certificate_carries_the_tube_and_an_outsider_finds_it_kept(system, tu
     assert np.abs(state[0, 1]) > 0.05 * record["outputs"]["theta"]
     spoiled = replace(tube, duals=0.8 * tube.duals)
     assert not cartpole_certificate(
-        system, load_metric(), question, proofs=[], held=[spoiled]
+        system, shipped_metric(), question, proofs=[], held=[spoiled]
     ).holds

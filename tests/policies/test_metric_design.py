@@ -13,7 +13,6 @@ from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.contraction import (
     CvStemSettings,
     InfeasibleError,
-    Region,
     contraction_residual,
     design_metric,
     design_on_pool,
@@ -26,6 +25,7 @@ from lagros_policies.tasks.cartpole.metric_design import (
     design_cartpole_metric,
     tube_samples,
 )
+from lagros_policies.tasks.cartpole.region import Region
 
 
 def stated_in_cvxpy(oracle, samples, region, settings):

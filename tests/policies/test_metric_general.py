@@ -15,7 +15,6 @@ from lagros_policies.contraction import (
     HeldControl,
     Metric,
     PlanRegion,
-    Region,
     Samples,
     certified_tube,
     contraction_residual,
@@ -37,6 +36,7 @@ from lagros_policies.proof import bounds
 from lagros_policies.proof.condition import prove_contraction
 from lagros_policies.remarks.stochastic import mean_square_bound
 from lagros_policies.tasks.cartpole.proof import prove_cartpole
+from lagros_policies.tasks.cartpole.region import Region
 from tests.policies.foreign import (
     Car,
     Pvtol,
@@ -47,6 +47,7 @@ from tests.policies.foreign import (
     reach,
     slopes,
 )
+from tests.policies.shipped import shipped_metric
 
 CAR_BOX = BoxRegion(
     (-2.0, -2.0, -1.0, 1.0), (2.0, 2.0, 1.0, 2.0), (0.3,) * 4, (-1.0, -1.0), (1.0, 1.0)
@@ -333,7 +334,7 @@ def test_noise_moves_no_metric_of_the_plan_and_others_are_refused():
     power = np.einsum("sii,i->s", matrices, intensity**2).max()
     assert bound.rate == 0.3
     assert bound.power == pytest.approx(power, rel=0.05)
-    with pytest.raises(ValueError, match="BoxRegion, has no angle"):
+    with pytest.raises(ValueError, match="BoxRegion, is even in no coordinate"):
         mean_square_bound(triple_metric("state"), intensity)
 
 
@@ -368,7 +369,7 @@ def test_what_is_of_one_coordinate_or_of_the_cartpole_refuses_another_metric():
         bounds.metric_drift(two, 0.0, 0.5)
     boxed = Metric(positive(4)[None], 0.2, 9.0, 1.0, np.ones(4), CAR_BOX)
     for metric, why in (
-        (replace(load_metric(), point="nominal"), "at the nominal, on a Region"),
+        (replace(shipped_metric(), point="nominal"), "at the nominal, on a Region"),
         (boxed, "on a BoxRegion"),
     ):
         with pytest.raises(ValueError, match=why):
@@ -392,8 +393,8 @@ def cloud_metric():
         pytest.param(car_metric(), id="box"),
         pytest.param(cloud_metric(), id="plans"),
         pytest.param(pvtol_metric(), id="state"),
-        pytest.param(replace(load_metric(), point="nominal"), id="nominal, on a Region"),
-        pytest.param(replace(load_metric(), basis=cosines(1, 4)), id="named"),
+        pytest.param(replace(shipped_metric(), point="nominal"), id="nominal, on a Region"),
+        pytest.param(replace(shipped_metric(), basis=cosines(1, 4)), id="named"),
     ],
 )
 def test_a_file_keeps_every_bit_of_a_general_metric(metric, tmp_path):
@@ -412,7 +413,7 @@ def test_a_file_keeps_every_bit_of_a_general_metric(metric, tmp_path):
 
 
 def test_a_metric_of_the_angle_is_written_as_ever(tmp_path):
-    metric = load_metric()
+    metric = shipped_metric()
     save_metric(replace(metric, basis=cosines(1, 4)), tmp_path / "named.json")
     save_metric(metric, tmp_path / "plain.json")
     assert (tmp_path / "named.json").read_bytes() == (tmp_path / "plain.json").read_bytes()
@@ -460,7 +461,7 @@ def test_a_region_of_one_s_own_flies_and_is_not_written(tmp_path):
 
     metric = replace(car_metric(), region=Own())
     assert extreme_eigenvalues(metric) == extreme_eigenvalues(car_metric())
-    with pytest.raises(TypeError, match="must be a Region, BoxRegion or PlanRegion"):
+    with pytest.raises(TypeError, match="must be a BoxRegion, a PlanRegion or that of a task"):
         save_metric(metric, tmp_path / "metric.json")
     assert not (tmp_path / "metric.json").exists()
 
@@ -472,7 +473,7 @@ def test_numbers_of_a_design_are_positive(number):
         design_on_region(Triple(), TRIPLE_BOX, settings, **{number: 0})
 
 
-def test_a_design_without_a_basis_is_of_the_cartpole():
+def test_a_design_without_a_basis_is_of_the_even_coordinate_of_a_region():
     settings = CvStemSettings(0.3, 2, scaling=(1.0,) * 6)
     samples = PVTOL_BOX.sample(np.random.default_rng(0), 5)
     with pytest.raises(ValueError, match=r"degree=2 .*name a basis, or take degree=0"):

@@ -13,7 +13,6 @@ from lagros_policies.contraction import (
     HeldControl,
     InfeasibleError,
     Metric,
-    Region,
     Samples,
     certified_tube,
     contraction_residual,
@@ -22,15 +21,16 @@ from lagros_policies.contraction import (
     verify_metric,
 )
 from lagros_policies.learning.networks import Mlp
-from lagros_policies.remarks.neural.design import hats, solve_at_angles, solve_on_pool
-from lagros_policies.remarks.neural.metric import (
+from lagros_policies.tasks.cartpole.metric_design import MetricDesignSettings, tube_samples
+from lagros_policies.tasks.cartpole.neural.design import hats, solve_at_angles, solve_on_pool
+from lagros_policies.tasks.cartpole.neural.metric import (
     OUTPUTS,
     NeuralMetric,
     load_neural_metric,
     save_neural_metric,
 )
-from lagros_policies.remarks.neural.training import NeuralTrainingSettings, fit_network
-from lagros_policies.tasks.cartpole.metric_design import MetricDesignSettings, tube_samples
+from lagros_policies.tasks.cartpole.neural.training import NeuralTrainingSettings, fit_network
+from lagros_policies.tasks.cartpole.region import Region
 
 MODEL, REGION = CartPole(), Region()
 SCALING = np.array([1.0, 12.0, 1.0, 1.5])

@@ -23,7 +23,7 @@ from lagros_policies import NAMES, make
 from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 
-OPTIONS = "lagros_policies.remarks.policies:"
+OPTIONS = "lagros_policies.tasks.cartpole.remarks:"
 SLIDING = "lagros_policies.tasks.spacecraft.sliding:SlidingCentralizedPolicy"
 CARTPOLE = (*NAMES, f"{OPTIONS}AdaptiveTubeMpcPolicy", f"{OPTIONS}NeuralTubeMpcPolicy")
 SPACECRAFT = (

@@ -18,11 +18,11 @@ from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.control import HeldControl
 from lagros_policies.remarks.lagrangian import SlidingAxis, steady_position_bound
-from lagros_policies.remarks.neural.metric import NeuralMetric, load_neural_metric
+from lagros_policies.tasks.cartpole.neural.metric import NeuralMetric, load_neural_metric
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
-NEURAL = "lagros_policies.remarks.policies:NeuralTubeMpcPolicy"
-ADAPTIVE = "lagros_policies.remarks.policies:AdaptiveTubeMpcPolicy"
+NEURAL = "lagros_policies.tasks.cartpole.remarks:NeuralTubeMpcPolicy"
+ADAPTIVE = "lagros_policies.tasks.cartpole.remarks:AdaptiveTubeMpcPolicy"
 SLIDING = "lagros_policies.tasks.spacecraft.sliding:SlidingCentralizedPolicy"
 
 

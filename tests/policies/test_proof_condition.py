@@ -12,13 +12,15 @@ from hypothesis import strategies as st
 import lagros_policies
 from lagros_envs.numbers import Interval
 from lagros_envs.tasks.cartpole.physics import CartPole
-from lagros_policies.contraction import Region, Samples, contraction_residual, load_metric
+from lagros_policies.contraction import Samples, contraction_residual, load_metric
 from lagros_policies.proof.bounds import prove_bounds
 from lagros_policies.proof.condition import largest_proved, prove_contraction
 from lagros_policies.proof.matrices import negative_definite
 from lagros_policies.tasks.cartpole.box import ProofBox
 from lagros_policies.tasks.cartpole.proof import PROVED_BOX, angle_box, prove_cartpole
+from lagros_policies.tasks.cartpole.region import Region
 from tests.policies.foreign import Pvtol
+from tests.policies.shipped import shipped_metric
 
 PROVED = Path(lagros_policies.__file__).parent / "pretrained" / "cartpole_proved_metric.json"
 SMALL = ProofBox(0.1, 0.5, 0.5, 0.5, angle_error=0.05, angular_rate_error=0.2)
@@ -26,7 +28,7 @@ SMALL = ProofBox(0.1, 0.5, 0.5, 0.5, angle_error=0.05, angular_rate_error=0.2)
 
 @pytest.fixture(scope="module")
 def shipped():
-    return load_metric()
+    return shipped_metric()
 
 
 def draw(box, count, seed):
@@ -93,7 +95,7 @@ def test_bad_metrics_are_refused_with_a_point_that_fails(system, shipped, oracle
 @settings(max_examples=6)
 @given(st.floats(0.02, 0.6), st.floats(0.0, 2.0), st.floats(0.0, 4.0), st.floats(0.1, 0.7))
 def test_no_box_with_a_sampled_failure_is_proved(angle, speed, force, alpha):
-    system, metric = CartPole(), load_metric()
+    system, metric = CartPole(), shipped_metric()
     box = ProofBox(angle, speed, speed, force, 0.2 * angle, 0.2 * speed)
     samples = draw(box, 1000, 3)
     worst = contraction_residual(system, replace(metric, contraction_rate=alpha), samples).max()

@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 
 from lagros_envs.numbers import Dual, Interval, Series, dual, exact, functions, variable
 from lagros_envs.numbers.functions import cos, sin
-from lagros_policies.contraction import Basis, BoxRegion, Metric, load_metric
+from lagros_policies.contraction import Basis, BoxRegion, Metric
 from lagros_policies.proof.enclosures import constant, enclosed_metric, held_slopes, slopes
 from tests.policies.foreign import positive
+from tests.policies.shipped import shipped_metric
 
 
 def series_of(x):
@@ -93,7 +94,7 @@ def test_the_map_of_a_hold_and_its_slopes_are_the_oracles(oracle, system):
 
 
 def test_a_metric_and_its_rate_are_enclosed_sharply():
-    metric, angle = load_metric(), np.linspace(-1.1, 1.1, 23)
+    metric, angle = shipped_metric(), np.linspace(-1.1, 1.1, 23)
     states, motion = np.zeros((23, 4)), np.zeros(4)
     states[:, 1], motion[1] = angle, 1.0
     zero = constant(np.zeros(23), 1)

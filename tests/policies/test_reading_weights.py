@@ -17,7 +17,7 @@ from lagros_policies.contraction import load_metric
 from lagros_policies.export.source import load_source
 from lagros_policies.learning.deep_set import DeepSet
 from lagros_policies.learning.networks import Mlp, read_safetensors
-from lagros_policies.remarks.neural.metric import load_neural_metric
+from lagros_policies.tasks.cartpole.neural.metric import load_neural_metric
 
 PRETRAINED = Path(load_source.__code__.co_filename).parents[1] / "pretrained"
 SHIPPED = {

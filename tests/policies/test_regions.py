@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from lagros_policies.contraction import BoxRegion, PlanRegion, Region, Samples
+from lagros_policies.contraction import BoxRegion, PlanRegion, Samples
 from lagros_policies.contraction.regions import search_region
+from lagros_policies.tasks.cartpole.region import Region
 
 BOX = BoxRegion((-1.0, 0.0, 2.0), (1.0, 3.0, 2.5), (0.5, 4.0, 0.1), (-1.0, 0.0), (0.0, 2.0))
 NODES = np.random.default_rng(0).uniform(-3.0, 3.0, (40, 5))

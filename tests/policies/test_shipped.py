@@ -17,7 +17,6 @@ from lagros_policies.contraction import (
     certified_tube,
     contraction_residual,
     extreme_eigenvalues,
-    load_metric,
 )
 from lagros_policies.learning.dataset import ExpertDataSettings, generate
 from lagros_policies.learning.networks import Mlp, read_safetensors
@@ -25,6 +24,7 @@ from lagros_policies.learning.train import learning_error
 from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 from lagros_policies.tasks.cartpole.features import cartpole_features
+from tests.policies.shipped import shipped_metric
 
 
 def needs(*names):
@@ -38,7 +38,7 @@ POLICIES = ("lagros", "learned")
 
 @pytest.fixture(scope="module")
 def shipped():
-    return load_metric()
+    return shipped_metric()
 
 
 def check_condition(oracle, metric, samples):

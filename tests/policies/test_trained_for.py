@@ -17,12 +17,12 @@ from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tube import PaperTube
 from lagros_policies import NAMES, make
 from lagros_policies.actor import Actor
-from lagros_policies.contraction import load_metric
 from lagros_policies.export.source import load_source
 from lagros_policies.learning.networks import read_safetensors, write_safetensors
 from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 from lagros_policies.trained_for import SETTINGS, training_of, weights_record
+from tests.policies.shipped import shipped_metric
 
 CARTPOLE_NETWORKS = ("learned", "lagros", "ppo", "sac", "td3", "residual")
 SPACECRAFT_NETWORKS = ("learned", "lagros", "ppo")
@@ -216,14 +216,14 @@ def test_the_shipped_metric_tracks_no_other_cart_pole():
     env = CartPoleEnv(settings=longer)
     for name in (
         "tube-mpc",
-        "lagros_policies.remarks.policies:AdaptiveTubeMpcPolicy",
-        "lagros_policies.remarks.policies:NeuralTubeMpcPolicy",
+        "lagros_policies.tasks.cartpole.remarks:AdaptiveTubeMpcPolicy",
+        "lagros_policies.tasks.cartpole.remarks:NeuralTubeMpcPolicy",
     ):
         with pytest.raises(ValueError, match=r"^system\.half_length=1\.0: the shipped metric"):
             make(name, env)
         assert make(name, env, allow_other_settings=True)
     # Who names a metric says that it is for this cart-pole.
-    assert make("tube-mpc", env, metric=load_metric()).name == "tube-mpc"
+    assert make("tube-mpc", env, metric=shipped_metric()).name == "tube-mpc"
     assert make("tube-mpc", CartPoleEnv(settings=CartPoleSettings(time_limit=18.0)))
 
 

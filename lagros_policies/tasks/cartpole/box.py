@@ -15,8 +15,8 @@ from lagros_envs.dynamics import System
 from lagros_envs.numbers import Interval, exact, functions
 from lagros_envs.tasks.cartpole.physics import ANGLE, VELOCITY, CartPole
 from lagros_policies.contraction.places import Point
-from lagros_policies.contraction.regions import Region
 from lagros_policies.proof.sets import ProofSet, Triple, boxed
+from lagros_policies.tasks.cartpole.region import Region
 from lagros_policies.tasks.cartpole.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]

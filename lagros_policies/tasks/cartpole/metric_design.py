@@ -14,13 +14,13 @@ from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction import (
     CvStemSettings,
     Metric,
-    Region,
     Samples,
     design_on_pool,
     verify_metric,
 )
 from lagros_policies.contraction.regions import joined
 from lagros_policies.tasks.cartpole.planner import CartPolePlanner
+from lagros_policies.tasks.cartpole.region import Region
 
 FloatArray = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ class MetricDesignSettings:
     pool: int = 60_000
     checks: int = 10_000
     seed: int = 0
-    cvstem: CvStemSettings = field(default_factory=CvStemSettings)
+    cvstem: CvStemSettings = field(default_factory=lambda: CvStemSettings(scaling=Region.scaling))
     region: Region = field(default_factory=Region)
 
     def __post_init__(self) -> None:

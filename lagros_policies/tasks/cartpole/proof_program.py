@@ -31,6 +31,7 @@ from lagros_policies.contraction.semidefinite import (
 from lagros_policies.proof.bounds import prove_bounds
 from lagros_policies.tasks.cartpole.box import ProofBox
 from lagros_policies.tasks.cartpole.proof import PROVED_BOX, angle_box
+from lagros_policies.tasks.cartpole.region import Region
 from lagros_policies.tasks.cartpole.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]
@@ -63,7 +64,9 @@ class ProvedDesignSettings:
     """
 
     cvstem: CvStemSettings = field(
-        default_factory=lambda: CvStemSettings(contraction_rate=0.5, margin=0.1)
+        default_factory=lambda: CvStemSettings(
+            contraction_rate=0.5, margin=0.1, scaling=Region.scaling
+        )
     )
     box: ProofBox = PROVED_BOX
     leaning: ProofBox = field(default_factory=lambda: ProofBox(0.9, 1.5, 1.5, 1.0, lean=1.0))
@@ -76,6 +79,11 @@ class ProvedDesignSettings:
         check_fields(self)
         if self.rounds < 1 or not (self.period > 0.0 and self.most_seconds > 0.0):
             raise ValueError("rounds must be at least 1, period and most_seconds positive")
+
+    @property
+    def scaling(self) -> FloatArray:
+        """Diagonal of S, shape (4,)."""
+        return np.array(self.cvstem.scaling or Region.scaling)
 
 
 @dataclass(frozen=True)
@@ -183,7 +191,7 @@ def _rate_blocks(
     system: CartPole, pool: Points, settings: ProvedDesignSettings, margin: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the condition's derivatives by W_i's entries (s, degree + 1, 10, 4, 4) and by nu."""
-    scale, symmetric = np.asarray(settings.cvstem.scaling), symmetric_basis(4)
+    scale, symmetric = settings.scaling, symmetric_basis(4)
     slope = jacobian(system, pool.other, pool.control)[0] * scale[:, None] / scale
     gain = control_matrix(system, pool.state) * scale[:, None]
     powers = cosine_powers(pool.state[:, ANGLE], settings.cvstem.degree)
@@ -200,7 +208,7 @@ def _held_blocks(
     system: CartPole, pool: Points, settings: ProvedDesignSettings, margin: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the same of the condition over a hold."""
-    scale, symmetric = np.asarray(settings.cvstem.scaling), symmetric_basis(4)
+    scale, symmetric = settings.scaling, symmetric_basis(4)
     following, slope, gain = linearise_hold(system, pool.state, pool.control, settings.period)
     slope, gain = slope * scale[:, None] / scale, gain * scale[:, None]
     before = cosine_powers(pool.state[:, ANGLE], settings.cvstem.degree)
@@ -262,14 +270,14 @@ def _normalised(
     system: CartPole, scaled: FloatArray, weights: FloatArray, settings: ProvedDesignSettings
 ) -> tuple[Metric, float]:
     """Scale W_bar so that I <= S W_bar S <= chi I is proved on the box, with the chi that is."""
-    scale = 1.0 / np.asarray(settings.cvstem.scaling)
+    scale = 1.0 / settings.scaling
     angle = max(settings.box.angle, settings.leaning.angle)
     metric = Metric(
         coefficients=scaled * scale[:, None] * scale,
         contraction_rate=settings.cvstem.contraction_rate,
         condition_bound=float(weights[1]),
         control_weight=float(weights[0]),
-        scaling=np.asarray(settings.cvstem.scaling),
+        scaling=settings.scaling,
         region=settings.box.region,
     )
     bounds = prove_bounds(system, metric, *angle_box(angle))

@@ -8,7 +8,7 @@ from lagros_envs.checks import shown
 from lagros_envs.tasks.cartpole.physics import ANGLE, CartPole
 from lagros_policies.contraction.basis import cosines
 from lagros_policies.contraction.metric import Metric
-from lagros_policies.contraction.regions import Region
+from lagros_policies.tasks.cartpole.region import Region
 
 
 def check_cartpole(system: Any, what: str) -> CartPole:

@@ -8,7 +8,7 @@ from lagros_benchmarks.worst_case.certificate import TubeCheck
 from lagros_benchmarks.worst_case.flights import Flights
 from lagros_benchmarks.worst_case.single import SingleBench
 from lagros_envs.dynamics import control_matrix
-from lagros_policies.contraction.metric import region_angle
+from lagros_policies.contraction.metric import even_region
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 
@@ -28,6 +28,6 @@ class CartPoleBench(SingleBench):
 def largest_gain(expert: CartPoleExpert, points: int = 1001) -> float:
     """Return b_bar, the largest ||B(x)|| over a grid of the region's angles (observed)."""
     states = np.zeros((points, 4))
-    states[:, 1] = np.linspace(0.0, region_angle(expert.metric), points)
+    states[:, 1] = np.linspace(0.0, even_region(expert.metric)[1], points)
     matrices = control_matrix(expert.task.system, states)
     return float(np.linalg.norm(matrices, axis=(1, 2)).max())

@@ -31,6 +31,7 @@ from lagros_policies.contraction.tube_design import (
     design_contained,
 )
 from lagros_policies.proof.condition import Proof
+from lagros_policies.room import shipped_file
 from lagros_policies.tasks.cartpole.box import ProofBox
 from lagros_policies.tasks.cartpole.certificate import CartPoleQuestion, cartpole_certificate
 from lagros_policies.tasks.cartpole.plans import PlanBox
@@ -212,7 +213,7 @@ def load_cartpole_metric(path: Path | None) -> Metric:
         ValueError: The file is no metric, or none of four states, or not symmetric to the last bit
             (the proofs use that W_bar is symmetric), or of a degree that nothing was designed for.
     """
-    metric = load_metric(path, _STATES)
+    metric = load_metric(path or shipped_file(CartPoleSettings(), "metric.json"), _STATES)
     coefficients = metric.coefficients
     if not np.array_equal(coefficients, np.swapaxes(coefficients, 1, 2)):
         raise ValueError(f"{path}: W_bar must be symmetric to the last bit: average it with W_bar'")

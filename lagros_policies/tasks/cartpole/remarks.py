@@ -1,9 +1,9 @@
-"""The remarks of the paper as policies that fly beside the others (`docs/extensions.md`).
+"""The remarks of the paper as policies of the cart-pole beside the others (`docs/extensions.md`).
 
 None of them is in the tables of results, so that they are named by module and class:
 
-    make("lagros_policies.remarks.policies:AdaptiveTubeMpcPolicy", env)
-    lagros bench cartpole --policies tube-mpc,lagros_policies.remarks.policies:NeuralTubeMpcPolicy
+    make("lagros_policies.tasks.cartpole.remarks:AdaptiveTubeMpcPolicy", env)
+    lagros bench cartpole --policies lagros_policies.tasks.cartpole.remarks:NeuralTubeMpcPolicy
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ from numpy.typing import NDArray
 
 from lagros_envs.aliases import moved_names
 from lagros_envs.conventions import settings_of
-from lagros_envs.dynamics import System
+from lagros_envs.dynamics import System, vector_field
 from lagros_envs.tasks.cartpole import task
+from lagros_envs.tasks.cartpole.physics import VELOCITY
 from lagros_policies.contraction.metric import ContractionMetric
 from lagros_policies.observed import observed_rows
 from lagros_policies.policy import PolicyState, row_memories
 from lagros_policies.remarks.adaptive import (
     AdaptiveControl,
-    cart_mass_regressor,
-    friction_regressor,
+    Regressor,
     largest_gain,
 )
-from lagros_policies.remarks.neural.metric import load_neural_metric
+from lagros_policies.tasks.cartpole.neural.metric import load_neural_metric
+from lagros_policies.tasks.cartpole.systems import check_cartpole
 from lagros_policies.tube_mpc import TubeMpcPolicy, TubeMpcState, check_own_metric
 
 Float32Array = NDArray[np.float32]
@@ -43,6 +44,40 @@ __getattr__ = moved_names(__name__)
 _REACH = (1.5, 8.0)
 _LIMITS = (3.0, 0.8)
 _LEAKAGE = 0.02  # [1/s]
+
+
+def friction_regressor(state: FloatArray, control: FloatArray) -> FloatArray:
+    """Return Y = -dp/dt, shape (..., 1): a is the true friction less the model's [N s/m].
+
+    Raises:
+        ValueError: The states are not of the cart-pole's four.
+    """
+    if np.shape(state)[-1:] != (4,):
+        raise ValueError(f"state of shape {np.shape(state)} must be the cart-pole's, (..., 4)")
+    return -state[..., VELOCITY, None]
+
+
+def slope_regressor(state: FloatArray, control: FloatArray) -> FloatArray:
+    """Return Y = 1, shape (..., 1): a is a constant force [N], as of a track that is not level."""
+    return np.ones((*state.shape[:-1], 1))
+
+
+def cart_mass_regressor(model: System) -> Regressor:
+    """Return Y = -d2p/dt2 of the model: a is the true mass of the cart less the model's [kg].
+
+    The equation of the cart reads (m_c + m) d2p/dt2 + ... = u, so that more mass is a force against
+    the acceleration. Y takes the model's acceleration for the true one, which is right to first
+    order in a.
+
+    Raises:
+        TypeError: The model is no cart-pole.
+    """
+    check_cartpole(model, "cart_mass_regressor")
+
+    def regressor(state: FloatArray, control: FloatArray) -> FloatArray:
+        return -vector_field(model, state, control)[..., VELOCITY, None]
+
+    return regressor
 
 
 class NeuralTubeMpcPolicy(TubeMpcPolicy):

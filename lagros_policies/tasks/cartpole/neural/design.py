@@ -24,9 +24,9 @@ from lagros_envs.dynamics import System
 from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.condition import Samples, condition_terms, contraction_residual
 from lagros_policies.contraction.cvstem import CvStemSettings, InfeasibleError
-from lagros_policies.contraction.regions import Region
 from lagros_policies.contraction.systems import check_sizes
-from lagros_policies.remarks.neural.metric import SIZE
+from lagros_policies.tasks.cartpole.neural.metric import SIZE
+from lagros_policies.tasks.cartpole.region import Region
 from lagros_policies.tasks.cartpole.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]
@@ -115,7 +115,7 @@ def solve_at_angles(
     check_cartpole(system, "solve_at_angles")
     check_at_least("angles", angles, 2)
     nodes = np.linspace(0.0, region.angle, angles)
-    scale = np.asarray(settings.scaling)
+    scale = np.asarray(settings.scaling or region.scaling)
     check_sizes(system, scaling=(scale, (SIZE,)))
     slope, gain, _ = condition_terms(system, samples)
     slope = slope * scale[:, None] / scale[None, :]

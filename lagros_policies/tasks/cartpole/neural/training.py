@@ -20,16 +20,16 @@ from lagros_envs.checks import (
 from lagros_envs.dynamics import System, control_matrix, state_dependent_coefficient
 from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE
 from lagros_policies.contraction.condition import Samples
-from lagros_policies.contraction.regions import Region
 from lagros_policies.learning.networks import Mlp
-from lagros_policies.remarks.neural.design import AngleSolution
-from lagros_policies.remarks.neural.metric import (
+from lagros_policies.tasks.cartpole.neural.design import AngleSolution
+from lagros_policies.tasks.cartpole.neural.metric import (
     OUTPUTS,
     SIZE,
     NeuralMetric,
     feature,
     feature_slope,
 )
+from lagros_policies.tasks.cartpole.region import Region
 from lagros_policies.tasks.cartpole.systems import check_cartpole
 
 FloatArray = NDArray[np.float64]

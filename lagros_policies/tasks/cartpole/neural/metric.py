@@ -30,9 +30,9 @@ from lagros_envs.reading import Record, named, parse_json
 from lagros_envs.tasks.cartpole.physics import ANGLE
 from lagros_policies.contraction.metric import Verification
 from lagros_policies.contraction.metric_files import design_arguments, design_record, naming
-from lagros_policies.contraction.places import at_angles
-from lagros_policies.contraction.regions import Region
+from lagros_policies.contraction.places import along
 from lagros_policies.learning.networks import Mlp
+from lagros_policies.tasks.cartpole.region import Region
 
 FloatArray = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ class NeuralMetric:
             check_positive("scaling", entry)
 
         angles = np.linspace(0.0, self.region.angle, _ANGLES)
-        matrices = self.matrix(at_angles(angles, SIZE))
+        matrices = self.matrix(along(angles, ANGLE, SIZE))
         if not np.all(np.isfinite(matrices)) or np.linalg.eigvalsh(matrices).min() <= 0.0:
             raise ValueError(
                 "the network's M is not finite and positive definite on the region: its weights "
@@ -190,7 +190,7 @@ def load_neural_metric(path: Path | str | None = None) -> NeuralMetric:
         ValueError: The file is not such a metric, or is damaged.
     """
     if path is None:
-        path = Path(__file__).parents[2] / "pretrained" / "cartpole_neural_metric.safetensors"
+        path = Path(__file__).parents[3] / "pretrained" / "cartpole_neural_metric.safetensors"
     network = Mlp.load(path)
     text = network.metadata.get("metric", "")
     name = f"the record of {named(path)}"
