@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import filecmp
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from lagros_benchmarks.tasks.spacecraft.reproduce import (
 )
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.learning.dataset import ExpertDataSettings
+from lagros_policies.learning.metric import MetricSettings
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.learning.train import TrainingSettings
 from lagros_policies.learning.train_deep_set import DeepSetTraining
@@ -92,6 +95,48 @@ def test_an_interrupted_run_ends_with_the_files_of_one_that_was_not(tmp_path):
     other = TrainingSettings(hidden=(16,), epochs=5)
     with pytest.raises(ValueError, match="other settings"):
         reproduce(tmp_path / "whole", small(lagros=other))
+
+
+@pytest.mark.slow
+def test_a_task_of_ones_own_is_made_with_a_round_of_flights_and_gone_on_with(tmp_path):
+    car = str(Path(__file__).parents[2] / "examples" / "car.py")
+    training = TrainingSettings(hidden=(8, 8, 8), epochs=2, checkpoint_every=1)
+    data = ExpertDataSettings(plans=20, samples=400, shards=2, disturbance_bound=0.4)
+    settings = ReproduceSettings(
+        car,
+        MetricSettings(pool=1000, checks=500),
+        data,
+        rounds=(replace(data, seed=1),),
+        between=training,
+        lagros=training,
+        learned=training,
+        episodes=2,
+        jobs=1,
+    )
+    assert settings.bound == 0.4
+
+    def stop_in_the_round(title, done, total):
+        if title == "round 1" and done == 1:
+            raise InterruptedRunError
+
+    reproduce(tmp_path / "whole", settings)
+    with pytest.raises(InterruptedRunError):
+        reproduce(tmp_path / "broken", settings, stop_in_the_round)
+    benchmark = reproduce(tmp_path / "broken", settings)
+    files = [name.replace("cartpole", "car") for name in FILES]
+    same, different, missing = filecmp.cmpfiles(
+        tmp_path / "whole", tmp_path / "broken", files, shallow=False
+    )
+    assert (sorted(same), different, missing) == (sorted(files), [], [])
+    run = run_benchmark(benchmark)
+    assert {case.policy for case in run.episodes} == {"learned", "tube-mpc", "lagros", "lqr"}
+    flown = next(records for case, records in run.episodes.items() if case.policy == "tube-mpc")
+    assert all(record.success for record in flown)
+
+
+def test_what_a_task_does_not_say_is_asked_for():
+    with pytest.raises(ValueError, match="slide does not say how its networks are made"):
+        ReproduceSettings("tests.policies.toys:Slide")
 
 
 SPACECRAFT_FILES = tuple(
