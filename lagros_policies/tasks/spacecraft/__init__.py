@@ -1,4 +1,4 @@
-"""What is special to the spacecraft: its policies, what they are told, and their safety filter."""
+"""What is special to the spacecraft: its policies, and what they are told of an environment."""
 
 from __future__ import annotations
 
@@ -39,16 +39,3 @@ def told(world: Any, given: Mapping[str, Any]) -> dict[str, Any]:
             "build the class of the policy yourself"
         )
     return {"preset": world.preset, **given}
-
-
-def filtered(policy: Any, world: Any, disturbance_bound: float) -> Any:
-    """Return a policy with the safety filter.
-
-    Args:
-        policy: The policy.
-        world: An environment of spacecraft; its task and preset are taken.
-        disturbance_bound: d_bar to prepare for, in units of the state per second.
-    """
-    from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
-
-    return SafetyFilter(policy, world.settings, world.preset, disturbance_bound=disturbance_bound)

@@ -42,10 +42,6 @@ from lagros_policies.tasks.spacecraft.sensed import Sensed
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.intp]
 
-# Parts of an observation that do not depend on how many neighbours and obstacles there can be.
-_OWN_PARTS = ("goal", "velocity", "heading", "spin", "time")
-_SLOT_PARTS = ("neighbours", "neighbour_mask", "obstacles", "obstacle_mask")
-
 
 @dataclass(frozen=True)
 class FlightSettings:
@@ -256,10 +252,9 @@ def flight_samples(
 def resize(observation: Float32Array, layout: Layout, larger: Layout) -> Float32Array:
     """Return observations (s, layout.size) with the empty slots of a larger layout."""
     resized = np.zeros((len(observation), larger.size), np.float32)
-    for name in (*_OWN_PARTS, *_SLOT_PARTS):
-        source, target = layout.slices[name], larger.slices[name]
-        width = source.stop - source.start
-        resized[:, target.start : target.start + width] = observation[:, source]
+    for name, source in layout.slices.items():
+        start = larger.slices[name].start
+        resized[:, start : start + source.stop - source.start] = observation[:, source]
     return resized
 
 
