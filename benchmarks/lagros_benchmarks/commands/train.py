@@ -27,10 +27,10 @@ KEPT = ("record.json", "weights.safetensors", "checkpoint.pt")
 
 
 def train(
-    task: Annotated[str, typer.Argument(help="cartpole, or spacecraft (preset paper).")],
+    task: Annotated[str, typer.Argument(help="As for `lagros bench`.")],
     algo: Annotated[
         str,
-        typer.Option(metavar="NAME[,NAME]", help="cartpole: of ppo, sac, td3. spacecraft: ppo."),
+        typer.Option(metavar="NAME[,NAME]", help="One body: of ppo, sac, td3. Many agents: ppo."),
     ] = "ppo",
     seed: Annotated[
         str,
@@ -47,15 +47,15 @@ def train(
     residual: Annotated[
         float | None,
         typer.Option(
-            metavar="NEWTONS",
-            help="cartpole: learn a correction of LAG-ROS of at most so much, 4 for instance.",
+            metavar="BETA",
+            help="Learn a correction of LAG-ROS of at most so much, in units of the control.",
         ),
     ] = None,
     parallel_env: Annotated[
         bool,
         typer.Option(
             "--parallel-env",
-            help="spacecraft: rows from PettingZoo's environment; the same episodes, slower.",
+            help="Of many agents: rows from PettingZoo's environment; the same episodes, slower.",
         ),
     ] = False,
     tensorboard: Annotated[
@@ -71,8 +71,8 @@ def train(
     ] = None,
 ) -> None:
     """Train agents, one after the other; go on where a run was killed, skip what is complete."""
-    from lagros_benchmarks.run.settings import check_task
-    from lagros_benchmarks.training.settings import default_training
+    from lagros_benchmarks.training.course import course_of, default_training
+    from lagros_envs.registry import find_task
 
     try:
         names = listed(algo, str, "--algo")
@@ -82,16 +82,17 @@ def train(
         for option, values in (("--algo", names), ("--seed", seeds)):
             if len(set(values)) < len(values):
                 raise ValueError(f"{option} names a run twice; give each once")
-        if parallel_env and task != "spacecraft":
-            raise ValueError(f"--parallel-env is for spacecraft; leave it out for {task}")
-        if residual is not None and task != "cartpole":
-            raise ValueError(f"--residual is for cartpole; leave it out for {task}")
-        check_task(task)
+        described = find_task(task)
+        many = course_of(described).takes_parallel
+        if parallel_env and not many:
+            raise ValueError(f"--parallel-env is for many agents; leave it out for {task}")
+        if residual is not None and many:
+            raise ValueError(f"--residual is for one body; leave it out for {task}")
         changes: dict[str, Any] = {} if segments is None else {"segments": segments}
         if residual is not None:
             changes["largest_correction"] = residual
         runs = [
-            replace(default_training(task, name), seed=number, **changes)
+            replace(default_training(described.name, name), seed=number, **changes)
             for number in seeds
             for name in names
         ]
@@ -139,7 +140,7 @@ def _train_one(
     import torch
     from rich.console import Console
 
-    from lagros_benchmarks.training.lessons import lesson_of
+    from lagros_benchmarks.training.course import lesson_of
     from lagros_benchmarks.training.run import Place
     from lagros_benchmarks.training.run import train as train_run
     from lagros_benchmarks.training.table import final_table

@@ -30,7 +30,7 @@ class Room:
         attack: Episodes and search of an attack, a `worst_case.attack.Bench`.
         certify: The certificate.
         reproduce: Everything from nothing.
-        train: Training by reinforcement.
+        train: How it is learned by reinforcement, a `training.course.SingleCourse`.
         demonstrations: The expert whose episodes `lagros data` writes.
     """
 
@@ -45,7 +45,7 @@ class Room:
     attack: str = "lagros_benchmarks.worst_case.single:SingleBench"
     certify: str = "lagros_benchmarks.evidence.single:certify"
     reproduce: str = "lagros_benchmarks.run.reproduce:ReproduceSettings"
-    train: str = "lagros_benchmarks.training.single:TRAINING"
+    train: str = "lagros_benchmarks.training.course:COURSE"
     demonstrations: str = "lagros_benchmarks.run.demonstrations:SingleExpert"
 
     def part(self, name: str) -> Any:

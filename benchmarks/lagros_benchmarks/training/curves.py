@@ -22,25 +22,9 @@ from lagros_benchmarks.report.canvas import (
     styles,
 )
 from lagros_benchmarks.run.surroundings import machine, versions
+from lagros_benchmarks.training.course import course_of
+from lagros_envs.registry import find_task
 
-# What is drawn of each task: name in the curves, title, factor.
-_PANELS: dict[str, tuple[tuple[str, str, float], ...]] = {
-    "cartpole": (
-        ("success", "success [%]", 100.0),
-        ("strict", "strict success [%]", 100.0),
-        ("reward", "reward of the task", 1.0),
-        ("effort", "effort of whole episodes [N² s]", 1.0),
-    ),
-    "spacecraft": (
-        ("success", "success [%]", 100.0),
-        ("strict_success", "strict success [%]", 100.0),
-        ("collided", "collided [%]", 100.0),
-    ),
-}
-_ABSCISSAE = {
-    "cartpole": "control steps [millions]",
-    "spacecraft": "control steps of all agents [millions]",
-}
 # What a point of a curve has besides its figures.
 AXES = ("steps", "seconds", "cpu_seconds")
 
@@ -90,7 +74,10 @@ def curves_of(records: Sequence[dict[str, Any]], command: str) -> dict[str, Any]
 def _label(training: dict[str, Any]) -> str:
     correction = training.get("largest_correction")
     name = str(training["algorithm"]["name"])
-    return name if correction is None else f"residual, {correction:g} N ({name})"
+    if correction is None:
+        return name
+    unit = find_task(training["task"]).control_unit  # type: ignore[attr-defined]
+    return f"residual, {correction:g}{' ' * bool(unit)}{unit} ({name})"
 
 
 def _curve(label: str, group: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -136,7 +123,9 @@ def draw(curves: dict[str, Any], path: str | Path) -> Path:
         The path.
     """
     path = check_figure_path(path)
-    panels = _PANELS[curves["task"]]
+    task = find_task(curves["task"])
+    course = course_of(task)
+    panels = course.panels(task)
     figure, axes = canvas(6.0, 1.0 + 1.9 * len(panels), len(panels), 1, share="row")
     looks = _looks([group["label"] for group in curves["curves"]])
     for panel, (name, title, factor) in zip(axes, panels, strict=True):
@@ -163,7 +152,7 @@ def draw(curves: dict[str, Any], path: str | Path) -> Path:
         handles, names, loc="outside upper left", ncols=4, frameon=False, handlelength=3.5
     )
     axes[-1].set_xlim(left=0.0)
-    axes[-1].set_xlabel(_ABSCISSAE[curves["task"]])
+    axes[-1].set_xlabel(course.abscissa)
     caption(figure, _caption(curves))
     return save(figure, path)
 

@@ -22,7 +22,7 @@ class ParallelVecEnv(AlikeVecEnv):
     """Parallel environments whose agents stay together, for one policy that all agents share.
 
     Row `world * agents + agent` is that agent of that world: row for row what `SB3VectorEnv` over
-    `SpacecraftVectorEnv` gives, from the same seeds, one world after the other. The agents of a
+    their vector form gives, from the same seeds, one world after the other. The agents of a
     world must begin and end together; a world that ends starts anew in the same step. Where it
     does, the info of each of its rows holds what stable-baselines3 reads there:
     `terminal_observation` (the last observation of the episode; the one returned already belongs
@@ -47,8 +47,8 @@ class ParallelVecEnv(AlikeVecEnv):
         for index, world in enumerate(self.worlds):
             if not hasattr(world, "possible_agents"):
                 raise ValueError(
-                    f"world {index} is {shown(world)}; it must be a parallel environment, such as "
-                    "lagros_envs.spacecraft_v0.parallel_env()"
+                    f"world {index} is {shown(world)}; it must be a parallel environment of "
+                    "PettingZoo, such as what parallel_env() of a world of many agents returns"
                 )
         first = self.worlds[0]
         self.agents = list(first.possible_agents)

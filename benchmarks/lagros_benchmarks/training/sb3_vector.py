@@ -68,7 +68,7 @@ class SB3VectorEnv(AlikeVecEnv):
         if not isinstance(venv, gym.vector.VectorEnv):
             raise ValueError(
                 f"venv={shown(venv)} must be a vector environment, such as gym.make_vec("
-                '"lagros/CartPole-v0", num_envs=64, autoreset_mode="same_step")'
+                '"lagros/...", num_envs=64, autoreset_mode="same_step")'
             )
         mode = venv.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:

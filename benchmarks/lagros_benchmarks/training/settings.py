@@ -18,13 +18,11 @@ from lagros_envs.checks import (
     check_positive,
     check_several,
     check_whole,
-    shown,
-    suggestion,
 )
 from lagros_envs.disturbances import OPEN_LOOP
+from lagros_envs.registry import find_task
 from lagros_envs.seeding import EVALUATION
-from lagros_envs.tasks.cartpole.task import CartPoleSettings
-from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS
+from lagros_envs.task import Task
 
 # Segments are namespaces of their own in `lagros_envs.seeding`'s sense, far below `EVALUATION`.
 MOST_SEGMENTS = 1 << 16
@@ -76,9 +74,8 @@ class Ppo(_Ranged):
         discount: gamma per control step.
         gae_decay: lambda of the generalised advantage estimate.
         clip_range: Clip of the probability ratio.
-        initial_log_std: Logarithm of the spread of the first actions. -2 is 5.4 N on the cart-pole,
-            where the usual 0 explores with 40 N, which makes every action costly and the pole fall
-            at once; and 0.14 N of each thruster of a spacecraft.
+        initial_log_std: Logarithm of the spread of the first actions. -2 is 14 % of the control's
+            scale; the usual 0 explores with all of it, which ends many an episode at once.
         hidden: Widths of the hidden tanh layers, of actor and critic each.
 
     Raises:
@@ -177,7 +174,7 @@ class Training(_Ranged):
         segments: Number of segments, each followed by an evaluation and a checkpoint.
         segment_steps: Control steps of every world in a segment.
         worlds: Worlds side by side.
-        effort_weight: Replaces that of the task's reward in training.
+        effort_weight: Replaces that of the task's reward in training; None leaves it.
         disturbance: Kind of disturbance in training.
         disturbance_bound: Its bound d_bar, in units of the state per second.
         curve_episodes: Held-out episodes (worlds) after every segment.
@@ -188,7 +185,6 @@ class Training(_Ranged):
     """
 
     task: ClassVar[str] = ""
-    not_negative: ClassVar[tuple[str, ...]] = ("effort_weight",)
     counts: ClassVar[tuple[str, ...]] = (
         "segments",
         "segment_steps",
@@ -201,7 +197,7 @@ class Training(_Ranged):
     segments: int = 20
     segment_steps: int = 270
     worlds: int = 64
-    effort_weight: float = 0.1
+    effort_weight: float | None = None
     disturbance: str = "uniform"
     disturbance_bound: float = 0.75
     curve_episodes: int = 200
@@ -210,6 +206,8 @@ class Training(_Ranged):
     def __post_init__(self) -> None:
         """Check the values."""
         super().__post_init__()
+        if self.effort_weight is not None:
+            check_not_negative("effort_weight", self.effort_weight)
         check_whole("seed", self.seed, 0, MOST_SEEDS - 1)
         check_name("disturbance", self.disturbance, OPEN_LOOP)
         check_disturbance_bound("disturbance_bound", self.disturbance_bound)
@@ -251,158 +249,51 @@ class Training(_Ranged):
 
 
 @dataclass(frozen=True)
-class CartPoleTraining(Training):
-    """A run on the cart-pole; attributes as in `Training`, and this.
+class SingleTraining(Training):
+    """A run with a task of one body; attributes as in `Training`, and these.
 
     Attributes:
-        effort_weight: At the task's 0.01 an agent balances at twice the effort.
-        largest_correction: The agent corrects LAG-ROS by at most so much [N]; None for an agent
-            that controls the cart-pole alone.
+        largest_correction: The agent corrects LAG-ROS by at most so much, in the units of the
+            control; None for an agent that controls the body alone.
+        task: The task.
 
     Raises:
         ValueError: A value is out of range.
     """
 
-    task: ClassVar[str] = "cartpole"
     largest_correction: float | None = None
+    task: str = ""  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         """Check the values."""
         super().__post_init__()
+        described = self.described
+        names = {item.name for item in fields(described)}
+        if self.effort_weight is not None and "effort_weight" not in names:
+            raise ValueError(
+                f"effort_weight={self.effort_weight!r}: {self.task} has no such setting; leave it "
+                "out for the weight of its reward"
+            )
         if self.largest_correction is not None:
             check_positive("largest_correction", self.largest_correction)
-            most = CartPoleSettings().force_scale
+            most = min(described.control_scale)
             if self.largest_correction > most:
                 raise ValueError(
                     f"largest_correction={self.largest_correction!r} is more than the actuator's "
-                    f"{most:g} N; leave it out for an agent that controls the cart-pole alone"
+                    f"{most:g} {described.control_unit}".rstrip()
+                    + f"; leave it out for an agent that controls {self.task} alone"
                 )
+
+    @property
+    def described(self) -> Task:
+        """The task."""
+        found: Any = find_task(self.task)
+        return found
 
     @property
     def label(self) -> str:
         """Name of the runs that differ in the seed alone."""
         if self.largest_correction is None:
             return super().label
-        return f"residual-{self.algorithm.name}-{self.largest_correction:g}N"
-
-
-@dataclass(frozen=True)
-class SpacecraftTraining(Training):
-    """A run with spacecraft, one policy for all; attributes as in `Training`, and these.
-
-    Attributes:
-        effort_weight: Higher than that of the task, as the weight of progress is.
-        preset: Preset of the scenarios.
-        agents: Agents in each world.
-        time_limit: Of an episode in training [s]: most of the 45 s of the task are spent at the
-            goal, where there is little left to learn.
-        progress_weight: Replaces that of the task's reward in training.
-        goal_weight: Reward per second within the goal's radius.
-        nearness_weight: Reward per second at a touch of another agent, negative sign applied.
-        nearness_range: Distance beyond touching at which that has fallen to nothing [m].
-        obstacle_weight: The same at a touch of an obstacle.
-        obstacle_range: Its distance [m].
-        first_share: Share of both weights that counts in the first segment.
-        growth: Share of the run after which they count in full.
-        final_agents: Numbers of agents in the evaluation at the end.
-        final_bounds: Their d_bar.
-        final_presets: Their presets.
-
-    Raises:
-        ValueError: A value is out of range.
-    """
-
-    task: ClassVar[str] = "spacecraft"
-    positive: ClassVar[tuple[str, ...]] = (
-        "time_limit",
-        "nearness_range",
-        "obstacle_range",
-        "first_share",
-        "growth",
-    )
-    not_negative: ClassVar[tuple[str, ...]] = (
-        *Training.not_negative,
-        "progress_weight",
-        "goal_weight",
-        "nearness_weight",
-        "obstacle_weight",
-    )
-    counts: ClassVar[tuple[str, ...]] = (*Training.counts, "agents")
-    algorithm: Algorithm = field(
-        default_factory=lambda: Ppo(
-            rollout_steps=128,
-            batch_size=4608,
-            epochs=5,
-            learning_rate=7e-4,
-            discount=0.995,
-            initial_log_std=-1.5,
-        )
-    )
-    segments: int = 20
-    segment_steps: int = 2560
-    worlds: int = 24
-    effort_weight: float = 0.05
-    disturbance_bound: float = 0.4
-    curve_episodes: int = 20
-    final_episodes: int = 200
-    preset: str = "paper"
-    agents: int = 6
-    time_limit: float = 20.0
-    progress_weight: float = 1.5
-    goal_weight: float = 0.5
-    nearness_weight: float = 12.0
-    nearness_range: float = 0.25
-    obstacle_weight: float = 12.0
-    obstacle_range: float = 0.15
-    first_share: float = 0.4
-    growth: float = 0.6
-    final_agents: tuple[int, ...] = (6,)
-    final_bounds: tuple[float, ...] = (0.4,)
-    final_presets: tuple[str, ...] = ("paper", "open")
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        super().__post_init__()
-        for preset in (self.preset, *self.final_presets):
-            check_name("preset", preset, PRESETS)
-        check_each("final_agents", self.final_agents, 1, MOST_AGENTS)
-        check_whole("agents", self.agents, 1, MOST_AGENTS)
-        for name in ("final_bounds", "final_presets"):
-            check_several(name, getattr(self, name), "a tuple with something in it")
-        for bound in self.final_bounds:
-            check_disturbance_bound("final_bounds", bound)
-
-    @property
-    def rows(self) -> int:
-        """Agents that learn side by side."""
-        return self.worlds * self.agents
-
-
-_BUFFERED: dict[str, Any] = {"segments": 24, "segment_steps": 125, "worlds": 128}
-# Algorithms of each task, with the settings that were found.
-DEFAULTS: dict[str, dict[str, Training]] = {
-    "cartpole": {
-        "ppo": CartPoleTraining(Ppo()),
-        "sac": CartPoleTraining(Sac(), effort_weight=0.01, **_BUFFERED),
-        "td3": CartPoleTraining(Td3(), effort_weight=0.01, **_BUFFERED),
-    },
-    "spacecraft": {"ppo": SpacecraftTraining()},
-}
-
-
-def default_training(task: str, algorithm: str) -> Training:
-    """Return the settings of a task and algorithm.
-
-    Raises:
-        ValueError: There are none.
-    """
-    if task not in DEFAULTS:
-        hint = suggestion(task, DEFAULTS)
-        raise ValueError(f"unknown task {shown(task)}.{hint} Valid: {', '.join(DEFAULTS)}.")
-    known = DEFAULTS[task]
-    if algorithm not in known:
-        raise ValueError(
-            f"--algo {shown(algorithm)} is not known for {task}.{suggestion(algorithm, known)} "
-            f"Use one of {', '.join(known)}"
-        )
-    return known[algorithm]
+        unit = self.described.control_unit
+        return f"residual-{self.algorithm.name}-{self.largest_correction:g}{unit}"

@@ -2,48 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from lagros_benchmarks.report.formats import number, percent, with_interval
+from lagros_benchmarks.training.course import course_of
+from lagros_envs.registry import find_task
 
 if TYPE_CHECKING:
     from rich.table import Table
-
-_Column = tuple[str, str, Callable[[dict[str, Any]], str]]
-
-
-def _disturbance(row: dict[str, Any]) -> str:
-    return "none" if row["disturbance"] == "none" else f"{row['disturbance']} {row['bound']:g}"
-
-
-def _success(row: dict[str, Any]) -> str:
-    return with_interval(row["success"], row["success_ci95"])
-
-
-# Heading (two lines) and content of each column.
-_COLUMNS: dict[str, tuple[_Column, ...]] = {
-    "cartpole": (
-        ("disturbance", "", _disturbance),
-        ("episodes", "", lambda row: str(row["episodes"])),
-        ("success", "%", _success),
-        ("strict", "%", lambda row: percent(row["strict"])),
-        ("fallen", "%", lambda row: percent(row["fallen"])),
-        ("effort", "N²s", lambda row: number(row["effort_to_success"])),
-        ("reward", "", lambda row: number(row["reward"])),
-    ),
-    "spacecraft": (
-        ("disturbance", "", _disturbance),
-        ("preset,", "agents", lambda row: f"{row['preset']}, {row['agents']}"),
-        ("worlds", "", lambda row: str(row["worlds"])),
-        ("success", "%", _success),
-        ("strict", "%", lambda row: percent(row["strict_success"])),
-        ("coll.", "%", lambda row: percent(row["collided"])),
-        ("effort", "N²s", lambda row: number(row["effort_to_success"])),
-        ("time", "s", lambda row: number(row["success_time"])),
-    ),
-}
-
 
 def final_table(record: dict[str, Any]) -> Table:
     """Return the figures at the end of a run, one line for each condition.
@@ -55,7 +21,8 @@ def final_table(record: dict[str, Any]) -> Table:
     from rich import box
     from rich.table import Table
 
-    columns = _COLUMNS[record["training"]["task"]]
+    task = find_task(record["training"]["task"])
+    columns = course_of(task).columns(task)
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, collapse_padding=True)
     for index, (heading, unit, _) in enumerate(columns):
         justify: Any = "right" if index else "left"

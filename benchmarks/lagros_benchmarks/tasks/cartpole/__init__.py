@@ -4,5 +4,6 @@ from lagros_benchmarks.run.room import Room
 
 ROOM = Room(
     attack="lagros_benchmarks.tasks.cartpole.attack:CartPoleBench",
+    train="lagros_benchmarks.tasks.cartpole.course:COURSE",
     certify="lagros_benchmarks.tasks.cartpole.certify:certify",
 )

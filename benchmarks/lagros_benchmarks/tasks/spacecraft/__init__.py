@@ -15,6 +15,7 @@ ROOM = Room(
     game=f"{_HERE}.game:SpacecraftGame",
     demonstrations=f"{_HERE}.demonstrations:SpacecraftExpert",
     attack=f"{_HERE}.attack:SpacecraftBench",
+    train=f"{_HERE}.course:COURSE",
     certify=f"{_HERE}.certify:certify",
     reproduce=f"{_HERE}.reproduce:SpacecraftReproduceSettings",
 )

@@ -22,7 +22,8 @@ from lagros_benchmarks.training.agent import actor_network
 from lagros_benchmarks.training.run import rounded
 from lagros_benchmarks.training.sb3_parallel import ParallelVecEnv
 from lagros_benchmarks.training.sb3_vector import SB3VectorEnv
-from lagros_benchmarks.training.settings import CURVE, FINAL, SpacecraftTraining
+from lagros_benchmarks.tasks.spacecraft.course import SpacecraftTraining
+from lagros_benchmarks.training.settings import CURVE, FINAL
 from lagros_envs import spacecraft_v0
 from lagros_envs.conventions import beyond_the_end
 from lagros_envs.seeding import episode_seeds

@@ -1,0 +1,45 @@
+"""How the cart-pole is learned: the settings that were found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from lagros_benchmarks.training.course import SingleCourse
+from lagros_benchmarks.training.settings import Ppo, Sac, SingleTraining, Td3, Training
+from lagros_envs.task import Task
+
+
+@dataclass(frozen=True)
+class CartPoleTraining(SingleTraining):
+    """A run on the cart-pole; attributes as in `SingleTraining`.
+
+    Attributes:
+        effort_weight: At the task's 0.01 an agent balances at twice the effort.
+    """
+
+    effort_weight: float | None = 0.1
+    task: str = "cartpole"
+
+
+# Ten times as long as that of `lagros train`, and otherwise the same: the shipped `ppo`.
+SHIPPED = CartPoleTraining(segments=40, segment_steps=1800, curve_episodes=500, final_episodes=2000)
+
+
+class CartPoleCourse(SingleCourse):
+    """See `SingleCourse`."""
+
+    place = "lagros_benchmarks.tasks.cartpole.training:CartPoleLesson"
+
+    def trainings(self, task: Task) -> Mapping[str, Training]:
+        """Return the settings of every algorithm, by its name."""
+        buffered: dict[str, Any] = {"segments": 24, "segment_steps": 125, "worlds": 128}
+        return {
+            "ppo": CartPoleTraining(Ppo()),
+            "sac": CartPoleTraining(Sac(), effort_weight=0.01, **buffered),
+            "td3": CartPoleTraining(Td3(), effort_weight=0.01, **buffered),
+        }
+
+
+COURSE = CartPoleCourse()
