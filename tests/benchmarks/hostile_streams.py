@@ -24,8 +24,8 @@ from lagros_benchmarks.report import figures
 from lagros_benchmarks.run import demonstrations, files, runner
 from lagros_benchmarks.tasks.spacecraft import certify as spacecraft_certify
 from lagros_benchmarks.tasks.spacecraft import scene_figure
+from lagros_benchmarks.training import course as training_course
 from lagros_benchmarks.training import curves
-from lagros_benchmarks.training import settings as training_settings
 from lagros_benchmarks.worst_case import attack
 from tests.benchmarks.tiny_training import TINY
 
@@ -105,7 +105,7 @@ def make_small() -> None:
     """Make what no option makes small, and let everything be flown once."""
     cli.DEMO |= {"episodes": 1, "policies": ("lqr",)}
     small = replace(TINY, segments=1)
-    training_settings.default_training = lambda *_: small
+    training_course.default_training = lambda *_: small
     runner.run_benchmark = once(runner.run_benchmark)
     runner.fly_scene = once(runner.fly_scene)
     attack.run_attack = once(attack.run_attack)

@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 
 from lagros_benchmarks.commands import cli
 from lagros_benchmarks.run.files import plain
+from lagros_benchmarks.tasks.cartpole.course import CartPoleTraining
 from lagros_benchmarks.tasks.spacecraft.certify import load_axis_metric
 from lagros_benchmarks.training.run import Place, train
-from lagros_benchmarks.training.settings import CartPoleTraining
 from lagros_benchmarks.worst_case import attack
 from lagros_benchmarks.worst_case.attack import AttackSettings
 from lagros_benchmarks.worst_case.replay import (

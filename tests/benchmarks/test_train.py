@@ -19,18 +19,18 @@ pytest.importorskip("stable_baselines3")
 from stable_baselines3.common.vec_env import VecNormalize
 
 from lagros_benchmarks.run.settings import BenchmarkSettings
-from lagros_benchmarks.tasks.cartpole import training as cartpole
+from lagros_benchmarks.tasks.cartpole.training import CartPoleLesson
+from lagros_benchmarks.training import single
 from lagros_benchmarks.training.agent import make_agent
-from lagros_benchmarks.training.lessons import lesson_of
+from lagros_benchmarks.training.course import course_of, default_training, lesson_of
 from lagros_benchmarks.training.run import Place, train
 from lagros_benchmarks.training.sb3_vector import SB3VectorEnv
 from lagros_benchmarks.training.settings import (
     CURVE,
-    DEFAULTS,
     FINAL,
     OffPolicy,
-    default_training,
 )
+from lagros_envs.registry import find_task, task_names
 from lagros_envs.seeding import EVALUATION, episode_seeds
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
@@ -81,9 +81,9 @@ def test_hyperparameters_that_make_no_sense_are_refused(algorithm, change):
 
 
 def test_every_default_can_be_built_and_written_down():
-    for task, algorithms in DEFAULTS.items():
-        for name, training in algorithms.items():
-            assert default_training(task, name) is training
+    for task in task_names():
+        for name, training in course_of(find_task(task)).trainings(find_task(task)).items():
+            assert default_training(task, name) == training
             assert training.record()["algorithm"]["name"] == name
             json.dumps(training.record(), allow_nan=False)
             if isinstance(training.algorithm, OffPolicy):
@@ -92,7 +92,7 @@ def test_every_default_can_be_built_and_written_down():
                 assert training.algorithm.buffer_size >= whole
     with pytest.raises(ValueError, match="Did you mean 'ppo'"):
         default_training("cartpole", "pppo")
-    with pytest.raises(ValueError, match="Valid: cartpole, spacecraft"):
+    with pytest.raises(ValueError, match="Did you mean 'cartpole'"):
         default_training("cartpoles", "ppo")
 
 
@@ -111,14 +111,14 @@ def test_no_episode_of_training_or_its_figures_is_one_of_the_benchmark():
 
 def test_the_figures_are_of_episodes_that_neither_training_nor_the_benchmark_meets(monkeypatch):
     training = replace(TINY, curve_episodes=40, final_episodes=50)
-    lesson = cartpole.CartPoleLesson(training)
+    lesson = CartPoleLesson(training)
     flown = []
 
     def spy(policy, seeds, *condition):
         flown.append((seeds, *condition))
         return {"success": 0.8}
 
-    monkeypatch.setattr(cartpole, "evaluate", spy)
+    monkeypatch.setattr(single, "evaluate", spy)
     model = make_agent(training, lesson.venv)
     lesson.figures(model)
     rows = lesson.final(model)
@@ -134,7 +134,7 @@ def test_the_worlds_in_training_are_those_of_the_settings(name, correction):
     algorithm = replace(ALGORITHMS[name], discount=0.97)
     task = {"effort_weight": 0.7, "disturbance": "sphere", "disturbance_bound": 0.3}
     training = replace(TINY, algorithm=algorithm, largest_correction=correction, **task)
-    venv = cartpole.CartPoleLesson(training).venv
+    venv = CartPoleLesson(training).venv
     disturbance, settings = venv.get_attr("disturbance")[0], venv.get_attr("settings")[0]
     assert (disturbance.kind, disturbance.bound) == ("sphere", 0.3)
     assert settings == CartPoleSettings(effort_weight=0.7)
@@ -152,10 +152,10 @@ def test_the_agent_has_the_hyperparameters_of_the_settings():
     ):
         algorithm = replace(ALGORITHMS[name], **change)
         training = replace(TINY, algorithm=algorithm, seed=5)
-        model = made[name] = make_agent(training, cartpole.CartPoleLesson(training).venv)
+        model = made[name] = make_agent(training, CartPoleLesson(training).venv)
         assert (model.gamma, model.seed) == (algorithm.discount, 5)
         assert model.batch_size == algorithm.batch_size
-        assert [len(bias) for bias in cartpole.actor_network(model).biases] == [8, 1]
+        assert [len(bias) for bias in single.actor_network(model).biases] == [8, 1]
         if isinstance(algorithm, OffPolicy):
             assert model.replay_buffer.buffer_size == algorithm.buffer_size // TINY.worlds
             assert (model.learning_starts, model.gradient_steps) == (64, 3)
@@ -172,7 +172,7 @@ def test_the_agent_has_the_hyperparameters_of_the_settings():
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_what_is_kept_of_a_correction_is_what_flew_in_training(name, tmp_path):
     training = replace(TINY, algorithm=ALGORITHMS[name], largest_correction=3.0)
-    lesson = cartpole.CartPoleLesson(training)
+    lesson = CartPoleLesson(training)
     if isinstance(lesson.venv, VecNormalize):
         lesson.venv.training = False  # the running mean is fixed at the export
     model = make_agent(training, lesson.venv)
@@ -222,7 +222,7 @@ def test_a_run_that_was_killed_ends_with_the_same_weights(name, correction, tmp_
     training = replace(TINY, algorithm=ALGORITHMS[name], largest_correction=correction)
     whole = run(training, tmp_path / "whole")
     calls = []
-    evaluate = cartpole.evaluate
+    evaluate = single.evaluate
 
     def killed(*arguments):
         calls.append(arguments)
@@ -230,7 +230,7 @@ def test_a_run_that_was_killed_ends_with_the_same_weights(name, correction, tmp_
             raise KeyboardInterrupt
         return evaluate(*arguments)
 
-    monkeypatch.setattr(cartpole, "evaluate", killed)
+    monkeypatch.setattr(single, "evaluate", killed)
     folder = tmp_path / "cut"
     with pytest.raises(KeyboardInterrupt):
         run(training, folder)
@@ -275,7 +275,7 @@ def test_a_run_without_its_weights_is_made_again(tmp_path, how):
 
 def test_the_folder_of_another_run_is_refused(tmp_path, monkeypatch):
     folder = tmp_path / "run"
-    monkeypatch.setattr(cartpole.CartPoleLesson, "final", lambda *_: pytest.fail("too far"))
+    monkeypatch.setattr(CartPoleLesson, "final", lambda *_: pytest.fail("too far"))
     with pytest.raises(pytest.fail.Exception):
         run(TINY, folder)
     other = replace(TINY, seed=1)
@@ -312,7 +312,7 @@ def test_the_record_says_what_the_weights_depend_on(tmp_path):
     said = json.loads(actor.metadata["trained_for"])
     assert said["equal"]["control_period"] == 0.1
     assert said["at_most"]["time_limit"] == 9.0
-    figures = cartpole.evaluate(
+    figures = single.evaluate(
         ActorPolicy(weights=actor), episode_seeds(0, 6, FINAL), "uniform", 0.75
     )
     assert figures["effort"] == pytest.approx(record["final"][1]["effort"], abs=1e-4)
@@ -325,14 +325,14 @@ def test_events_hold_the_curve_once_also_after_a_kill(tmp_path, monkeypatch):
 
     training = replace(TINY, algorithm=ALGORITHMS["td3"])
     saved = []
-    save = cartpole.CartPoleLesson.figures
+    save = CartPoleLesson.figures
 
     def killed_once(lesson, model):
         figures = save(lesson, model)
         saved.append(figures)
         return figures
 
-    monkeypatch.setattr(cartpole.CartPoleLesson, "figures", killed_once)
+    monkeypatch.setattr(CartPoleLesson, "figures", killed_once)
     from lagros_benchmarks.training import run as run_module
 
     write = run_module._save
@@ -386,8 +386,8 @@ def test_a_process_that_is_killed_for_good_goes_on(tmp_path):
 def test_the_corrected_worlds_are_moved_by_both():
     settings = CartPoleSettings()
     worlds = CartPoleVectorEnv(5, "uniform", settings=settings, autoreset_mode="same_step")
-    env = cartpole.CorrectedWorlds(
-        SB3VectorEnv(worlds), LagrosPolicy(settings), 4.0, settings.force_scale
+    env = single.CorrectedWorlds(
+        SB3VectorEnv(worlds), LagrosPolicy(settings), 4.0, settings.control_scale
     )
     plain = CartPoleVectorEnv(5, "uniform", settings=settings, autoreset_mode="same_step")
     env.seed(3)
@@ -403,7 +403,9 @@ def test_the_corrected_worlds_are_moved_by_both():
         theirs, expected, *_ = plain.step(force / settings.force_scale)
         np.testing.assert_allclose(reward, expected, rtol=1e-4, atol=1e-4)
     with pytest.raises(RuntimeError, match="reset"):
-        cartpole.CorrectedWorlds(SB3VectorEnv(worlds), base, 4.0, 40.0).step_async(np.zeros((5, 1)))
+        single.CorrectedWorlds(SB3VectorEnv(worlds), base, 4.0, (40.0,)).step_async(
+            np.zeros((5, 1))
+        )
 
 
 def test_the_figures_count_what_happens_before_the_first_fall():
@@ -420,7 +422,7 @@ def test_the_figures_count_what_happens_before_the_first_fall():
         action_clip=1.0,
         control_scale=(40.0,),
     )
-    figures = cartpole.evaluate(Never(weights=actor), episode_seeds(1, 50), "none", 0.0)
+    figures = single.evaluate(Never(weights=actor), episode_seeds(1, 50), "none", 0.0)
     assert figures["fallen"] == 1.0
     assert figures["strict"] == 0.0
     assert figures["effort"] == 0.0

@@ -19,10 +19,12 @@ from typer.testing import CliRunner
 from lagros_benchmarks.commands import train as command
 from lagros_benchmarks.commands.cli import app
 from lagros_benchmarks.report import canvas
+from lagros_benchmarks.tasks.cartpole.course import CartPoleCourse
+from lagros_benchmarks.tasks.spacecraft.course import SpacecraftTraining
 from lagros_benchmarks.training import curves as curves_module
+from lagros_benchmarks.training.course import lesson_of
 from lagros_benchmarks.training.curves import curves_of, draw, range_confidence
-from lagros_benchmarks.training.lessons import lesson_of
-from lagros_benchmarks.training.settings import DEFAULTS, SpacecraftTraining, Training
+from lagros_benchmarks.training.settings import Training
 from lagros_benchmarks.training.table import final_table
 from lagros_envs.tasks.cartpole.env import CartPoleEnv
 from lagros_policies.policy import make
@@ -112,8 +114,8 @@ def test_the_range_holds_the_median_as_often_as_it_says():
 
 
 def test_the_command_trains_several_runs_and_draws_them(tmp_path, monkeypatch):
-    monkeypatch.setitem(DEFAULTS["cartpole"], "ppo", TINY)
-    monkeypatch.setitem(DEFAULTS["cartpole"], "td3", replace(TINY, algorithm=ALGORITHMS["td3"]))
+    tiny = {"ppo": TINY, "td3": replace(TINY, algorithm=ALGORITHMS["td3"])}
+    monkeypatch.setattr(CartPoleCourse, "trainings", lambda *_: tiny)
     arguments = ["train", "cartpole", "--algo", "ppo,td3", "--seed", "0,1", "--segments", "1"]
     files = ["--json", str(tmp_path / "a.json"), "--figure", str(tmp_path / "a.png")]
     out = ["--out", str(tmp_path / "runs")]

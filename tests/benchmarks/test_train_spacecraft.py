@@ -11,15 +11,15 @@ import pytest
 pytest.importorskip("stable_baselines3")
 
 from lagros_benchmarks.tasks.spacecraft import training
+from lagros_benchmarks.tasks.spacecraft.course import SpacecraftTraining
 from lagros_benchmarks.training.agent import actor_network, make_agent
+from lagros_benchmarks.training.course import default_training
 from lagros_benchmarks.training.run import Place, train
 from lagros_benchmarks.training.sb3_vector import SB3VectorEnv
 from lagros_benchmarks.training.settings import (
     CURVE,
     FINAL,
     Ppo,
-    SpacecraftTraining,
-    default_training,
 )
 from lagros_envs import spacecraft_v0
 from lagros_envs.seeding import episode_seeds

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import torch
 
-from lagros_benchmarks.training.settings import CartPoleTraining, Ppo, Sac, Td3
+from lagros_benchmarks.tasks.cartpole.course import CartPoleTraining
+from lagros_benchmarks.training.settings import Ppo, Sac, Td3
 
 BUFFER = {"batch_size": 32, "gradient_steps": 3, "warm_up": 64, "hidden": (8,)}
 ALGORITHMS = {

@@ -9,8 +9,8 @@ import torch
 from stable_baselines3 import A2C, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
-from lagros_benchmarks.tasks.cartpole.training import evaluate, extract_actor
 from lagros_benchmarks.training.sb3_vector import LinearFeatures, SB3VectorEnv
+from lagros_benchmarks.training.single import evaluate, extract_actor
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.tasks.cartpole.env import CartPoleEnv
 from lagros_envs.tasks.cartpole.task import CartPoleSettings

@@ -44,7 +44,8 @@ _MOVED = {
     "cartpole_tables": "report.single_tables",
     "reproduce": "run.reproduce",
     "worst_case.cartpole": "worst_case.single",
-    "training.cartpole": "tasks.cartpole.training",
+    "training.cartpole": "training.single",
+    "training.lessons": "training.course",
     "spacecraft_episodes": "tasks.spacecraft.episodes",
     "spacecraft_experiment": "tasks.spacecraft.experiment",
     "spacecraft_figures": "tasks.spacecraft.figures",
@@ -56,10 +57,17 @@ _MOVED = {
     "worst_case.spacecraft": "tasks.spacecraft.worst_case",
     "worst_case.plane": "tasks.spacecraft.plane",
     "training.spacecraft": "tasks.spacecraft.training",
-    "training.shipped_ppo": "tasks.spacecraft.shipped_ppo",
+    "training.shipped_ppo": "tasks.cartpole.shipped_ppo",
     "sb3_parallel": "training.sb3_parallel",
     "sb3_vector": "training.sb3_vector",
 }
 MOVED = {f"lagros_benchmarks.{old}": f"lagros_benchmarks.{new}" for old, new in _MOVED.items()}
 # As in `lagros_envs.tasks.moved`.
-NAMES = {"lagros_benchmarks.report": "lagros_benchmarks.report.delivery"}
+NAMES = {
+    "lagros_benchmarks.report": "lagros_benchmarks.report.delivery",
+    "lagros_benchmarks.training.settings": {
+        "CartPoleTraining": "lagros_benchmarks.tasks.cartpole.course",
+        "SpacecraftTraining": "lagros_benchmarks.tasks.spacecraft.course",
+        "default_training": "lagros_benchmarks.training.course",
+    },
+}

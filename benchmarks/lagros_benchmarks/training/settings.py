@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, ClassVar
 
+from lagros_envs.aliases import moved_names
 from lagros_envs.checks import (
     check_disturbance_bound,
     check_each,
@@ -16,7 +17,6 @@ from lagros_envs.checks import (
     check_name,
     check_not_negative,
     check_positive,
-    check_several,
     check_whole,
 )
 from lagros_envs.disturbances import OPEN_LOOP
@@ -297,3 +297,6 @@ class SingleTraining(Training):
             return super().label
         unit = self.described.control_unit
         return f"residual-{self.algorithm.name}-{self.largest_correction:g}{unit}"
+
+
+__getattr__ = moved_names(__name__)

@@ -11,6 +11,7 @@ from lagros_envs.registry import find_task
 if TYPE_CHECKING:
     from rich.table import Table
 
+
 def final_table(record: dict[str, Any]) -> Table:
     """Return the figures at the end of a run, one line for each condition.
 

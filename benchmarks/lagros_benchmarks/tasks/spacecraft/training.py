@@ -18,11 +18,11 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from lagros_benchmarks.run.metrics import cluster_rate_interval
+from lagros_benchmarks.tasks.spacecraft.course import SpacecraftTraining
 from lagros_benchmarks.training.agent import actor_network
 from lagros_benchmarks.training.run import rounded
 from lagros_benchmarks.training.sb3_parallel import ParallelVecEnv
 from lagros_benchmarks.training.sb3_vector import SB3VectorEnv
-from lagros_benchmarks.tasks.spacecraft.course import SpacecraftTraining
 from lagros_benchmarks.training.settings import CURVE, FINAL
 from lagros_envs import spacecraft_v0
 from lagros_envs.conventions import beyond_the_end
