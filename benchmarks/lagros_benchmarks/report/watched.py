@@ -95,6 +95,7 @@ def efforts(what: str, to_success: float, to_end: float, unit: str) -> str:
         to_end: To the end of the episode.
         unit: Of the control; "" for none.
     """
+    unit = f"({unit})" if "/" in unit else unit
     squared = f" {unit}²s" if unit else ""
     if to_end == to_success:
         return f"{what} {to_end:.2f}{squared}"

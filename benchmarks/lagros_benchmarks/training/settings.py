@@ -184,7 +184,8 @@ class Training(_Ranged):
         ValueError: A value is out of range.
     """
 
-    task: ClassVar[str] = ""
+    # A name, which a task of one body makes a field of it.
+    task = ""
     counts: ClassVar[tuple[str, ...]] = (
         "segments",
         "segment_steps",
@@ -262,7 +263,7 @@ class SingleTraining(Training):
     """
 
     largest_correction: float | None = None
-    task: str = ""  # type: ignore[misc]
+    task: str = ""
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lagros_benchmarks.run.metrics import wilson_interval
 from lagros_benchmarks.run.room import room_of
-from lagros_benchmarks.run.settings import check_policy, check_task
+from lagros_benchmarks.run.settings import check_policy
 from lagros_benchmarks.worst_case.goals import GOALS
 from lagros_benchmarks.worst_case.replay import Outcome, WorstCases
 from lagros_benchmarks.worst_case.search import MOST, Found, SearchSettings
@@ -99,7 +99,7 @@ class AttackSettings:
     def __post_init__(self) -> None:
         """Check the settings."""
         check_fields(self)
-        check_task(self.task)
+        find_task(self.task)
         check_policy(self.policy, self.task)
         check_name("goal", self.goal, GOALS)
         check_positive("bound", self.bound)
