@@ -174,8 +174,8 @@ def test_the_folder_of_a_run_names_what_it_is(tmp_path):
         (["cartpole", "--seed", "0,1,0"], "--seed names a run twice"),
         (["cartpole", "--algo", "ppo,,ppo"], "--algo: an entry is empty"),
         (["cartpole", "--segments", "0"], "segments=0"),
-        (["cartpole", "--parallel-env"], "for spacecraft"),
-        (["spacecraft", "--residual", "3"], "for cartpole"),
+        (["cartpole", "--parallel-env"], "for many agents"),
+        (["spacecraft", "--residual", "3"], "for one body"),
         (["cartpole", "--residual", "-3"], "--residual=-3.0"),
         (["cartpole", "--residual", "1e9"], "more than the actuator's 40 N"),
         (["cartpole", "--figure", "a.txt"], "must end in"),
@@ -190,7 +190,7 @@ def test_arguments_that_make_no_sense_are_refused(arguments, text, tmp_path, mon
 
 
 def test_a_task_that_is_not_known_has_no_lesson():
-    with pytest.raises(TypeError, match="of no task"):
+    with pytest.raises(ValueError, match="unknown task ''"):
         lesson_of(Training())
 
 

@@ -42,7 +42,7 @@ class SingleCourse:
             "task": task.name,
         }
         # A rollout is an episode of every world; a segment is three of them.
-        rollout = {"rollout_steps": task.steps, "batch_size": 16 * task.steps}
+        rollout: dict[str, Any] = {"rollout_steps": task.steps, "batch_size": 16 * task.steps}
         buffered: dict[str, Any] = {"segments": 24, "segment_steps": 125, "worlds": 128}
         return {
             "ppo": SingleTraining(Ppo(**rollout), segment_steps=3 * task.steps, **shared),

@@ -288,7 +288,8 @@ class SingleTraining(Training):
     @property
     def described(self) -> Task:
         """The task."""
-        found: Any = find_task(self.task)
+        found = find_task(self.task)
+        assert isinstance(found, Task)
         return found
 
     @property

@@ -19,7 +19,7 @@ class CartPoleTraining(SingleTraining):
         effort_weight: At the task's 0.01 an agent balances at twice the effort.
     """
 
-    effort_weight: float | None = 0.1
+    effort_weight: float = 0.1
     task: str = "cartpole"
 
 

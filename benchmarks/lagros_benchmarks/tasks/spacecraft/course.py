@@ -46,7 +46,7 @@ class SpacecraftTraining(Training):
         ValueError: A value is out of range.
     """
 
-    task: ClassVar[str] = "spacecraft"
+    task = "spacecraft"
     positive: ClassVar[tuple[str, ...]] = (
         "time_limit",
         "nearness_range",
@@ -75,7 +75,7 @@ class SpacecraftTraining(Training):
     segments: int = 20
     segment_steps: int = 2560
     worlds: int = 24
-    effort_weight: float | None = 0.05
+    effort_weight: float = 0.05
     disturbance_bound: float = 0.4
     curve_episodes: int = 20
     final_episodes: int = 200
