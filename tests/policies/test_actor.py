@@ -29,11 +29,8 @@ from lagros_policies.residual import ResidualPolicy
 from lagros_policies.room import PRETRAINED
 
 TANH = {"net_arch": [16, 8], "activation_fn": torch.nn.Tanh}
-<<<<<<< HEAD
 FRAME = goal_frame(CartPoleSettings())
-=======
 FORCE = (40.0,)  # [N]
->>>>>>> 38222c6 (wip: tests)
 CLASSES = {"ppo": PPO, "sac": SAC, "td3": TD3}
 
 
@@ -69,11 +66,7 @@ def observations():
 
 @pytest.fixture(scope="module")
 def actor():
-<<<<<<< HEAD
-    return extract_actor(agent(PPO, FRAME))
-=======
-    return extract_actor(agent(PPO, goal_frame()), FORCE)
->>>>>>> 38222c6 (wip: tests)
+    return extract_actor(agent(PPO, FRAME), FORCE)
 
 
 @pytest.mark.parametrize("name", CLASSES)
