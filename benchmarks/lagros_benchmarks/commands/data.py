@@ -70,12 +70,12 @@ def export(
     except ImportError as error:
         fail(error, status=1)
     from lagros_benchmarks.run.demonstrations import DemonstrationSettings, demonstrate
-    from lagros_envs.registry import find_task, task_names
+    from lagros_envs.registry import find_task, first_task
 
     try:
         if disturbance == "none":
             refuse_options(["--bound"], "no disturbance has a bound")
-        described = find_task(task or task_names()[0])
+        described = find_task(task or first_task())
         settings = DemonstrationSettings(described.name, episodes, seed, disturbance, bound)
     except ValueError as error:
         fail(error)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from lagros_envs.checks import (
     check_whole,
 )
 from lagros_envs.disturbances import KINDS
-from lagros_envs.registry import find_task
+from lagros_envs.registry import find_task, first_task
 from lagros_envs.task import Described
 
 # Slower films would have pictures without end, faster ones none.
@@ -58,7 +58,7 @@ class WatchSettings:
         ImportError: What writes the video is not installed.
     """
 
-    task: str
+    task: str = field(default_factory=first_task)
     policy: str = "lagros"
     agents: int | None = None
     preset: str | None = None

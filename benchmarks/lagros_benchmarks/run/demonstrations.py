@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar, cast
 
 import gymnasium as gym
@@ -21,7 +21,7 @@ from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.room import room_of
 from lagros_envs.checks import check_disturbance_bound, check_fields, check_seed, check_whole
 from lagros_envs.disturbances import OPEN_LOOP
-from lagros_envs.registry import find_task
+from lagros_envs.registry import find_task, first_task
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.task import Described
 from lagros_policies.policy import BasePolicy, PolicyState
@@ -50,7 +50,7 @@ class DemonstrationSettings:
         ValueError: A value is not valid.
     """
 
-    task: str
+    task: str = field(default_factory=first_task)
     episodes: int = 100
     seed: int = 0
     disturbance: str = "uniform"

@@ -20,7 +20,7 @@ from lagros_envs.checks import (
     check_whole,
 )
 from lagros_envs.disturbances import OPEN_LOOP
-from lagros_envs.registry import find_task
+from lagros_envs.registry import find_task, first_task
 from lagros_envs.seeding import EVALUATION
 from lagros_envs.task import Task
 
@@ -263,7 +263,7 @@ class SingleTraining(Training):
     """
 
     largest_correction: float | None = None
-    task: str = ""
+    task: str = field(default_factory=first_task)
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -26,7 +26,7 @@ from lagros_envs.checks import (
     check_whole,
 )
 from lagros_envs.reading import Record
-from lagros_envs.registry import find_task
+from lagros_envs.registry import find_task, first_task
 from lagros_envs.seeding import episode_seeds
 
 FloatArray = NDArray[np.float64]
@@ -85,7 +85,7 @@ class AttackSettings:
         ValueError: A setting is not valid.
     """
 
-    task: str
+    task: str = field(default_factory=first_task)
     policy: str = "lagros"
     goal: str = "tube"
     bound: float = 0.75
