@@ -63,7 +63,7 @@ def gif_bytes(frames: Iterable[Frame], rate: float) -> bytes:
     """Return the frames as a GIF that repeats, with one palette for all of them.
 
     One palette without dithering leaves what does not move unchanged from frame to frame, and what
-    is unchanged is left out: after the first, a frame holds what moved.
+    is unchanged is left out.
 
     Args:
         frames: As in `video_bytes`.
@@ -75,14 +75,10 @@ def gif_bytes(frames: Iterable[Frame], rate: float) -> bytes:
     """
     image = _import_pillow()
     # Drawings compress a hundredfold, so that a long episode fits into memory.
-    packed: list[bytes] = []
-    begins, count, shape = [], 0, (0, 0, 0)
+    packed, shape = [], (0, 0, 0)
     for frame in frames:
-        data = zlib.compress(np.ascontiguousarray(frame).tobytes(), 1)
-        if not packed or data != packed[-1]:  # one that is as the last only makes that one stay
-            packed.append(data)
-            begins.append(count)
-        count, shape = count + 1, frame.shape
+        packed.append(zlib.compress(np.ascontiguousarray(frame).tobytes(), 1))
+        shape = frame.shape
     if not packed:
         raise ValueError("there is no frame to write")
 
@@ -91,25 +87,11 @@ def gif_bytes(frames: Iterable[Frame], rate: float) -> bytes:
 
     chosen = np.unique(np.linspace(0, len(packed) - 1, _PALETTE_FRAMES).round().astype(int))
     sample = np.concatenate([np.asarray(unpacked(packed[index])) for index in chosen])
-    colours = common_colours(sample)
     palette = image.new("P", (1, 1))
-    palette.putpalette(colours.ravel().tolist())
-    unchanged = len(colours)  # the number of a colour that no pixel has
-
-    def moved() -> Iterator[Any]:
-        before = None
-        for data in packed:
-            coded = unpacked(data).quantize(palette=palette, dither=image.Dither.NONE)
-            now = np.asarray(coded)
-            kept = now if before is None else np.where(now == before, np.uint8(unchanged), now)
-            picture = image.fromarray(kept)
-            picture.putpalette([*colours.ravel().tolist(), 255, 255, 255])
-            before = now
-            yield picture
-
-    images = moved()
+    palette.putpalette(common_colours(sample).ravel().tolist())
+    images = (unpacked(one).quantize(palette=palette, dither=image.Dither.NONE) for one in packed)
     # In hundredths of a second, rounded so that the whole takes as long as it should.
-    instants = np.round(100.0 / rate * np.array([*begins, count])).astype(int)
+    instants = np.round(100.0 / rate * np.arange(len(packed) + 1)).astype(int)
     stream = io.BytesIO()
     next(images).save(
         stream,
@@ -119,8 +101,7 @@ def gif_bytes(frames: Iterable[Frame], rate: float) -> bytes:
         # [ms]; viewers slow down what is faster.
         duration=np.maximum(20, 10 * np.diff(instants)).tolist(),
         loop=0,
-        optimize=False,
-        transparency=unchanged,
+        optimize=True,  # leaves out what has not changed
         disposal=1,
     )
     return stream.getvalue()
