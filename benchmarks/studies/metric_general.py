@@ -1,4 +1,4 @@
-r"""Metrics of systems that are no cart-pole: a car and a planar quadrotor, designed and checked.
+r"""Metrics that tasks describe, designed and checked: of the car and of the planar quadrotor.
 
 - The car [x, y, heading, speed] is steered by turn rate and acceleration: the controls move all
   that its motion depends on, so that its metric is a function of x_d.
@@ -16,90 +16,39 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-import numpy as np
-from studies.planar import Car, Pvtol
+from studies.planar import CAR
 
+from lagros_envs import Task, find_task
 from lagros_envs.checks import check_whole
-from lagros_envs.dynamics import System
 from lagros_envs.files import write_atomic
-from lagros_policies.contraction import (
-    Basis,
-    BoxRegion,
-    CvStemSettings,
-    certified_tube,
-    design_on_region,
-    harmonics,
-    powers,
-    products,
-    search_violation,
-    verify_metric,
-)
+from lagros_policies.contraction import certified_tube, search_violation
+from lagros_policies.learning.metric import MetricSettings
 
-_DESIGN, _CHECK, _SEARCH = 1, 2, 3  # seeds
+_SEARCH = 3  # seed
 
 
-def car() -> tuple[System, BoxRegion, CvStemSettings]:
-    """Return the car, where its metric must hold, and what to design."""
-    region = BoxRegion(
-        low=(-5.0, -5.0, -math.pi, 0.5),
-        high=(5.0, 5.0, math.pi, 2.5),
-        error=(0.5, 0.5, 0.5, 0.5),
-        control_low=(-2.0, -1.0),
-        control_high=(2.0, 1.0),
-    )
-    # A turned plan has a turned metric: of second degree in the sine and cosine of its heading.
-    basis = products(harmonics(2, 2), powers(3, 1))
-    settings = CvStemSettings(0.5, 0, 0.05, 0.1, (1.0,) * 4, basis, "nominal")
-    return Car(), region, settings
-
-
-def pvtol() -> tuple[System, BoxRegion, CvStemSettings]:
-    """Return the quadrotor, where its metric must hold, and what to design."""
-    third, body = math.pi / 3, Pvtol()
-    hover = body.hover
-    region = BoxRegion(
-        low=(-5.0, -5.0, -third, -2.0, -1.0, -third),
-        high=(5.0, 5.0, third, 2.0, 1.0, third),
-        error=(0.5, 0.5, 0.3, 0.5, 0.5, 0.5),
-        control_low=(hover - 1.0,) * 2,
-        control_high=(hover + 1.0,) * 2,
-    )
-    basis = Basis(("1", "cos(x[2])", "sin(x[2])", "x[3]"))
-    scaling = (1.0, 1.0, 3.0, 1.0, 1.0, 1.0)
-    return body, region, CvStemSettings(0.5, 0, 0.05, 0.1, scaling, basis)
-
-
-CASES = {"car": car, "pvtol": pvtol}
-
-
-def study(
-    system: System, region: BoxRegion, settings: CvStemSettings, checks: int
-) -> dict[str, Any]:
+def study(task: Task, checks: int) -> dict[str, Any]:
     """Design a metric, check it, and look for where it is worst."""
     begun = time.perf_counter()
-    metric = design_on_region(system, region, settings, seed=_DESIGN)
+    metric = MetricSettings(checks=checks).design(task)
     designed = time.perf_counter()
-    fresh = region.sample(np.random.default_rng(_CHECK), checks)
-    check = verify_metric(system, metric, fresh, _CHECK).verification
-    assert check is not None
-    _, worst = search_violation(system, metric, _SEARCH)
+    _, worst = search_violation(task.system, metric, _SEARCH)
+    assert metric.verification is not None
     return {
         "rate": metric.contraction_rate,
         "chi": metric.condition_bound,
         "nu": metric.control_weight,
         "functions": metric.phi.size,
         "tube_per_disturbance": certified_tube(metric, 1.0).steady_radius,
-        "verification": asdict(check),
+        "verification": asdict(metric.verification),
         "worst_searched": worst,
         "design_s": designed - begun,
-        "check_s": time.perf_counter() - designed,
     }
 
 
@@ -107,11 +56,11 @@ def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description="Metrics of a car and of a planar quadrotor.")
     parser.add_argument("--checks", type=int, default=10_000)
-    parser.add_argument("--systems", default=",".join(CASES))
     parser.add_argument("--json", type=Path, default=None)
     wanted = parser.parse_args()
     check_whole("checks", wanted.checks)
-    found = {name: study(*CASES[name](), wanted.checks) for name in wanted.systems.split(",")}
+    tasks = {"car": CAR, "pvtol": cast(Task, find_task("pvtol"))}
+    found = {name: study(task, wanted.checks) for name, task in tasks.items()}
     text = json.dumps(found, indent=1)
     sys.stdout.write(text + "\n")
     if wanted.json is not None:

@@ -1,69 +1,27 @@
 """Two bodies among discs that the general planner is measured on: a car and a planar quadrotor.
 
-The systems and their limits are those of C3M (Sun, Jha & Fan 2021); the quadrotor's equations are
-those of Singh et al. (2017), with the velocity in the body's axes.
+The bodies are those of `examples/car.py` and `lagros/Pvtol-v0`; the limits are those of C3M (Sun,
+Jha & Fan 2021). The discs are drawn another way than in the tasks, as they were when the figures
+were published.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics.system import Components
+from lagros_envs import Task, find_task
+from lagros_envs.tasks.pvtol.physics import Pvtol
 from lagros_policies.planning import Discs, Problem
 
 FloatArray = NDArray[np.float64]
 
-GRAVITY = 9.81  # [m/s^2]
 BODY_RADIUS, MARGIN, DISC_RADIUS = 0.2, 0.15, 0.5
-
-
-@dataclass(frozen=True)
-class Car:
-    """[x, y, theta, v] under turn rate omega [rad/s] and acceleration a [m/s^2]."""
-
-    state_dim: int = 4
-    control_dim: int = 2
-
-    def derivative(self, state: Components, control: Components, functions: Any) -> Components:
-        """Return dx/dt."""
-        _, _, heading, speed = state
-        turn, acceleration = control
-        return speed * functions.cos(heading), speed * functions.sin(heading), turn, acceleration
-
-
-@dataclass(frozen=True)
-class Pvtol:
-    """[p_x, p_z, phi, v_x, v_z, dphi/dt] under the thrusts of two rotors [N]."""
-
-    mass: float = 0.486
-    inertia: float = 0.00383
-    arm: float = 0.25
-    gravity: float = GRAVITY
-    state_dim: int = 6
-    control_dim: int = 2
-
-    def derivative(self, state: Components, control: Components, functions: Any) -> Components:
-        """Return dx/dt."""
-        _, _, roll, along, up, rate = state
-        first, second = control
-        sine, cosine = functions.sin(roll), functions.cos(roll)
-        return (
-            along * cosine - up * sine,
-            along * sine + up * cosine,
-            rate,
-            up * rate - self.gravity * sine,
-            (first + second) / self.mass - along * rate - self.gravity * cosine,
-            self.arm * (first - second) / self.inertia,
-        )
-
-    @property
-    def hover(self) -> float:
-        """Thrust of each rotor that holds a hover [N]."""
-        return 0.5 * self.mass * self.gravity
+CAR = cast(Task, find_task(str(Path(__file__).parents[2] / "examples" / "car.py")))
+GRAVITY = Pvtol().gravity  # [m/s^2]
 
 
 def car_problem(rng: np.random.Generator, period: float = 0.1) -> Problem:
@@ -72,7 +30,7 @@ def car_problem(rng: np.random.Generator, period: float = 0.1) -> Problem:
     goal = np.array([9.0, rng.uniform(-2.0, 2.0), rng.uniform(-0.5, 0.5), 1.5])
     discs = _discs(rng, start[:2], goal[:2], (1.5, 7.5), (-2.5, 2.5))
     return Problem(
-        Car(),
+        CAR.system,
         period,
         round(6.0 / period),
         start,

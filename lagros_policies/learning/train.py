@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
+# Labels that spread less than this share of the largest spread, squared, are the same all over.
+_STILL = 1e-12
+
 
 @dataclass(frozen=True)
 class TrainingSettings:
@@ -127,7 +130,11 @@ def fit(
 
 
 class _Run(Fit[TrainingSettings]):
-    """A run over features and labels, each scaled to mean zero and deviation one."""
+    """A run over features and labels, each scaled to mean zero and deviation one.
+
+    Labels are uncorrelated as well: of two rotors the sum moves far more than the difference, which
+    turns the body and would be drowned.
+    """
 
     def __init__(
         self,
@@ -143,9 +150,9 @@ class _Run(Fit[TrainingSettings]):
 
         self.alike = alike
         self.input_mean, self.input_scale = _statistics(features[:first], alike)
-        self.output_mean, self.output_scale = _statistics(labels[:first])
+        self.output_mean, self.output_units = _units(labels[:first])
         self.features = torch.from_numpy((features - self.input_mean) / self.input_scale)
-        self.labels = torch.from_numpy((labels - self.output_mean) / self.output_scale)
+        self.labels = torch.from_numpy(_in_units(labels - self.output_mean, self.output_units))
         torch.manual_seed(settings.seed)
         widths = [features.shape[1], *settings.hidden, labels.shape[1]]
         self.layers = new_layers(widths, alike)
@@ -176,8 +183,8 @@ class _Run(Fit[TrainingSettings]):
         weights, biases = network_of(self.layers, self.alike)
         weights[0] = weights[0] / self.input_scale[:, None]
         biases[0] = biases[0] - self.input_mean @ weights[0]
-        weights[-1] = weights[-1] * self.output_scale
-        biases[-1] = biases[-1] * self.output_scale + self.output_mean
+        weights[-1] = weights[-1] @ self.output_units
+        biases[-1] = biases[-1] @ self.output_units + self.output_mean
         return Mlp(weights, biases)
 
 
@@ -194,3 +201,20 @@ def _statistics(
         ):
             part[-alike.things * alike.size :] = np.tile(scale, alike.things)
     return mean, np.where(deviation > 0.0, deviation, np.float32(1.0))
+
+
+def _units(labels: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Return the mean of labels, (m,), and the rows of which they are uncorrelated sums, (m, m)."""
+    mean, deviation = _statistics(labels)
+    if len(mean) == 1:
+        return mean, deviation[:, None]
+    values, vectors = np.linalg.eigh(np.cov(labels, rowvar=False, dtype=np.float64))
+    # What never moves keeps its unit.
+    lengths = np.sqrt(np.where(values > _STILL * values[-1], values, 1.0))
+    return mean, (lengths[:, None] * vectors.T).astype(np.float32)
+
+
+def _in_units(labels: Float32Array, units: Float32Array) -> Float32Array:
+    if len(units) == 1:
+        return labels / units[0]
+    return np.asarray(labels @ np.linalg.inv(units.astype(np.float64)), np.float32)

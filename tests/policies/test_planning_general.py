@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.integrate
-from studies.planar import GRAVITY, Car, Pvtol, car_problem, pvtol_problem
+from studies.planar import CAR, GRAVITY, car_problem, pvtol_problem
 
 from lagros_envs.dynamics import check_system, hold_step, linearise_hold
+from lagros_envs.tasks.pvtol.physics import Pvtol
 from lagros_policies.planning import (
     Discs,
     PlannerSettings,
@@ -100,7 +101,7 @@ def check(problem, plan, rates, tolerance):
     assert plan.clearance >= -DISTANCE_SLACK
 
 
-@pytest.mark.parametrize("system", [Car(), Pvtol()])
+@pytest.mark.parametrize("system", [CAR.system, Pvtol()])
 def test_the_systems_are_sound(system):
     check_system(system)
 

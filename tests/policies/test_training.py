@@ -65,7 +65,7 @@ def test_a_constant_input_does_no_harm(data, tmp_path):
 def test_several_outputs_are_fitted(data, tmp_path):
     features, labels = data
     both = np.column_stack([labels, -2.0 * labels + 1.0])
-    settings = replace(SETTINGS, epochs=80)
+    settings = replace(SETTINGS, epochs=120)
     network = fit(features, both, settings, tmp_path / "run")
     assert np.abs(network(features) - both).mean(0) == pytest.approx([0.0, 0.0], abs=3.0)
 
@@ -191,3 +191,15 @@ def test_learning_error_is_measured_sample_by_sample():
 def test_settings_out_of_range_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         TrainingSettings(**bad)
+
+
+def test_a_small_difference_of_large_outputs_is_learned_as_well_as_their_sum(tmp_path):
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(2000, 2)).astype(np.float32)
+    total, apart = 10.0 + 5.0 * np.tanh(inputs[:, 0]), 0.05 * np.tanh(inputs[:, 1])
+    labels = np.stack([total + apart, total - apart], axis=1).astype(np.float32)
+    settings = TrainingSettings(hidden=(12,), epochs=40, batch=64, learning_rate=1e-2)
+    found = fit(inputs, labels, settings, tmp_path / "checkpoint")(inputs)
+    sums, differences = found.sum(axis=1), found[:, 0] - found[:, 1]
+    assert np.mean(np.abs(sums - 2.0 * total)) < 0.1 * 2.0 * np.std(total)
+    assert np.mean(np.abs(differences - 2.0 * apart)) < 0.1 * 2.0 * np.std(apart)
