@@ -216,5 +216,6 @@ def _units(labels: Float32Array) -> tuple[Float32Array, Float32Array]:
 
 def _in_units(labels: Float32Array, units: Float32Array) -> Float32Array:
     if len(units) == 1:
-        return labels / units[0]
+        quotient: Float32Array = labels / units[0]
+        return quotient
     return np.asarray(labels @ np.linalg.inv(units.astype(np.float64)), np.float32)
