@@ -59,7 +59,7 @@ def onnx_file(source: Source) -> bytes:
     deep = bool(sizes)
     first = graph.do("Reshape", given[0], np.array([0, 1, own])) if deep else given[0]
     names = dict(zip(program.places, graph.split(first, [1] * own), strict=True))
-    seen = graph.lines(program.looking, names)
+    seen = graph.lines(program.looking, names, program.places)
     count = len(seen) - len(program.contexts)
     context = dict(zip(program.contexts, seen[count:], strict=True))
     inputs = seen[:count]
@@ -72,7 +72,7 @@ def onnx_file(source: Source) -> bytes:
     pieces = graph.split(answer, [1] * outputs)
     acting = program.acting
     named = {**dict(zip(acting.inputs, pieces, strict=False)), **context}
-    control = graph.joined(graph.lines(acting, named))
+    control = graph.joined(graph.lines(acting, named, acting.inputs))
     if program.last is not None:
         control = graph.do("Relu", graph.do("MatMul", control, program.last))
     size = program.control.size
@@ -152,8 +152,17 @@ class _Graph:
             value = self.do(activation, value) if activation else value
         return value
 
-    def lines(self, line: StraightLine, names: dict[str, str]) -> list[str]:
-        """Add recorded operations; the names of the inputs are replaced by those of values."""
+    def lines(
+        self, line: StraightLine, names: dict[str, str], places: Sequence[str], zeros: str = ""
+    ) -> list[str]:
+        """Add recorded operations.
+
+        Args:
+            line: The operations.
+            names: Of inputs to those of values.
+            places: Inputs that have the shape of the outputs.
+            zeros: Of that shape; made of the first input if left out.
+        """
         known = dict(names)
 
         def value(operand: str) -> str:
@@ -172,7 +181,15 @@ class _Graph:
             elif operation.symbol not in ("<=", ">") or name in asked:
                 operands = map(value, operation.operands)
                 known[name] = self.do(_OPERATORS[operation.symbol], *operands)
-        return [value(output) for output in line.outputs]
+        shaped = _depending(line, places)
+        results = []
+        for output in line.outputs:
+            result = value(output)
+            if output not in shaped:
+                zeros = zeros or self.do("Mul", value(places[0]), 0.0)
+                result = self.do("Add", result, zeros)
+            results.append(result)
+        return results
 
     def pooled(
         self, kind: Bodies, line: StraightLine, given: Sequence[str], context: dict[str, str]
@@ -189,15 +206,10 @@ class _Graph:
         slots = self.do("Reshape", given[0], np.array([0, kind.slots, size]))
         mask = self.do("Reshape", given[1], np.array([0, kind.slots, 1]))
         places = dict(zip(kind.each.places, self.split(slots, [1] * size), strict=True))
-        *features, weight = self.lines(line, {**places, **context})
-        # What does not differ among the slots takes their shape.
-        differs = _depending(line, kind.each.places)
         zeros = self.do("Mul", mask, 0.0)
-        shaped = [
-            value if output in differs else self.do("Add", value, zeros)
-            for value, output in zip(features, line.outputs, strict=False)
-        ]
-        seen = self.layers(self.joined(shaped), kind.layers, "Relu", "Relu")
+        names = {**places, **context}
+        *features, weight = self.lines(line, names, kind.each.places, zeros)
+        seen = self.layers(self.joined(features), kind.layers, "Relu", "Relu")
         # Zero times the mask: a NaN there must not hide a body.
         sensed = self.do("Where", self.do("Greater", mask, 0.0), weight, zeros)
         return self.do("ReduceSum", self.do("Mul", seen, sensed), np.array([1]), keepdims=1)

@@ -126,7 +126,9 @@ class Program:
         def look(given: Numbers) -> Numbers:
             found = dict(zip(self.places, given, strict=True))
             (first, *features), context = self.look(given)
-            return [first + sum(0.0 * found[place] for place in hidden), *features, *context]
+            for place in hidden:
+                first = first + 0.0 * found[place]
+            return [first, *features, *context]
 
         return straight_line(look, self.places) if hidden else record
 
