@@ -13,7 +13,7 @@ from lagros_envs.numbers import functions
 from lagros_envs.task import LARGEST_CONTROL, Scenario, Task
 from lagros_policies.learning.features import seen, view_of
 from lagros_policies.learning.networks import Mlp
-from lagros_policies.planning.joint.grid_path import segment_distance
+from lagros_policies.planning.vectors import segment_distance
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lagros_envs.checks import check_fields, check_whole
 from lagros_envs.dynamics import vector_field
-from lagros_policies.planning.joint.grid_path import GridSettings, shortest_paths, walk
+from lagros_policies.planning.grid_path import GridSettings, shortest_paths, walk
 from lagros_policies.planning.problem import Problem
 from lagros_policies.planning.scp import ScpSettings, solve_scp
 from lagros_policies.planning.trajectory import Trajectory

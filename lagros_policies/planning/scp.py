@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from lagros_envs.checks import check_above, check_fields, check_not_negative
 from lagros_envs.dynamics import hold_step, linearise_hold
 from lagros_envs.dynamics.integrate import SUBSTEPS
-from lagros_policies.planning.joint.grid_path import segment_distance
 from lagros_policies.planning.problem import DISTANCE_SLACK, Problem
 from lagros_policies.planning.program import Linearisation, Programs
 from lagros_policies.planning.qp import QpSolver, solve_qp
 from lagros_policies.planning.trajectory import Trajectory
+from lagros_policies.planning.vectors import segment_distance
 
 FloatArray = NDArray[np.float64]
 

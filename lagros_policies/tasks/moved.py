@@ -13,7 +13,6 @@ _MOVED = {
     "half_planes": "safety.half_planes",
     "planning.cartpole": "tasks.cartpole.planner",
     "planning.spacecraft": "planning.joint.planner",
-    "planning.grid_path": "planning.joint.grid_path",
     "planning.joint_plan": "planning.joint.plan",
     "planning.joint_problem": "planning.joint.problem",
     "planning.joint_program": "planning.joint.program",

@@ -9,24 +9,25 @@ import pytest
 
 from lagros_envs.dynamics import hold_step
 from lagros_envs.tasks.spacecraft.physics import Spacecraft
-from lagros_policies.planning.joint import grid_path
-from lagros_policies.planning.joint import scp as joint_scp
-from lagros_policies.planning.joint.grid_path import (
+from lagros_policies.planning import grid_path
+from lagros_policies.planning.grid_path import (
     GridSettings,
-    search_in_turn,
-    segment_distance,
     shortest_paths,
     smooth_progress,
     straighten,
     walk,
 )
+from lagros_policies.planning.joint import scp as joint_scp
+from lagros_policies.planning.joint import search
 from lagros_policies.planning.joint.plan import swept_distances
 from lagros_policies.planning.joint.planner import (
     JointPlanner,
     JointPlannerSettings,
 )
 from lagros_policies.planning.joint.problem import JointScpSettings
+from lagros_policies.planning.joint.search import search_in_turn
 from lagros_policies.planning.qp import QpSolution
+from lagros_policies.planning.vectors import segment_distance
 from lagros_policies.tasks.spacecraft.setup import write_plan
 from lagros_policies.tasks.spacecraft.thrusters import thrust_for_acceleration
 
@@ -396,14 +397,14 @@ def test_search_in_turn_lets_the_later_agent_give_way():
 @pytest.mark.parametrize("far", [60.0, 300.0, 1e6])
 def test_no_more_cells_are_looked_at_however_far_things_are(monkeypatch, far):
     counts = []
-    search, chain = grid_path.dijkstra, grid_path._cheapest_chain
+    dijkstra, chain = grid_path.dijkstra, search._cheapest_chain
     monkeypatch.setattr(
         grid_path,
         "dijkstra",
-        lambda graph, **options: (counts.append(graph.shape[0]), search(graph, **options))[1],
+        lambda graph, **options: (counts.append(graph.shape[0]), dijkstra(graph, **options))[1],
     )
     monkeypatch.setattr(
-        grid_path,
+        search,
         "_cheapest_chain",
         lambda prices, *ends: (counts.append(prices[0].size), chain(prices, *ends))[1],
     )

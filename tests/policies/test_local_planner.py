@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from lagros_policies.planning.joint.grid_path import GridSettings, segment_distance, shortest_paths
+from lagros_policies.planning.grid_path import GridSettings, shortest_paths
 from lagros_policies.planning.local.guess import pass_aside, way_around
 from lagros_policies.planning.local.map import LocalMap
 from lagros_policies.planning.local.motion import Discs
 from lagros_policies.planning.local.plan import LocalPlanner
 from lagros_policies.planning.local.problem import LocalPlannerSettings
+from lagros_policies.planning.vectors import segment_distance
 
 HERE = np.zeros(2)
 

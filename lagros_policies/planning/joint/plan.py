@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_policies.planning.joint.grid_path import segment_distance
 from lagros_policies.planning.joint.scp import positions_between
+from lagros_policies.planning.vectors import segment_distance
 
 FloatArray = NDArray[np.float64]
 

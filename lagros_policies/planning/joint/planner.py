@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
-from lagros_policies.planning.joint.grid_path import (
+from lagros_policies.planning.grid_path import (
     GridSettings,
-    search_in_turn,
     shortest_paths,
     smooth_progress,
     walk,
@@ -22,6 +21,7 @@ from lagros_policies.planning.joint.grid_path import (
 from lagros_policies.planning.joint.plan import JointPlan, divisor, instants, swept_distances
 from lagros_policies.planning.joint.problem import JointProblem, JointScpSettings
 from lagros_policies.planning.joint.scp import JointSolution, positions_between, solve_joint
+from lagros_policies.planning.joint.search import search_in_turn
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

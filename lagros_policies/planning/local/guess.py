@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
-from lagros_policies.planning.joint.grid_path import segment_distance, straighten
+from lagros_policies.planning.grid_path import straighten
+from lagros_policies.planning.vectors import segment_distance
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -11,7 +11,7 @@ import piqp
 from numpy.typing import NDArray
 
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
-from lagros_policies.planning.joint.grid_path import walk
+from lagros_policies.planning.grid_path import walk
 from lagros_policies.planning.local.guess import pass_aside, progress, way_around
 from lagros_policies.planning.local.motion import (
     Discs,

@@ -1,9 +1,8 @@
-"""First guesses for the joint planner: shortest paths on a grid, and searches in space and time.
+"""First guesses of where a body goes among discs: shortest paths on a grid.
 
-Guesses need not obey any constraint. They choose the side on which an agent passes an obstacle or
-another agent, which the quadratic programs that follow cannot change. Every choice is
-deterministic; ties go to the side that leaves the obstacle on the left and to agents that keep to
-the right.
+Guesses need not obey any constraint. They choose the side on which a body passes an obstacle, which
+the quadratic programs that follow cannot change. Every choice is deterministic; ties go to the side
+that leaves the obstacle on the left.
 
 However far starts, goals and obstacles lie apart, no more cells are looked at than `GridSettings`
 says: where one grid for all would have more, each agent has one of its own, as coarse as it must
@@ -21,6 +20,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
+from lagros_policies.planning.vectors import segment_distance
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -29,6 +29,8 @@ IntArray = NDArray[np.intp]
 _FEWEST = 400
 # Far beyond any arena, and far below where differences of positions lose the obstacles [m].
 _FARTHEST = 1e9
+# From a cell to those around it.
+STEPS = [(i, j) for i in range(-2, 3) for j in range(-2, 3)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +96,11 @@ def shortest_paths(
     Returns:
         One polyline per agent, shape (points, 2), from its start to its goal [m].
     """
-    frames = _frames(starts, goals, obstacles, settings.cell, settings.border, settings.most_cells)
+    frames = frames_around(
+        starts, goals, obstacles, settings.cell, settings.border, settings.most_cells
+    )
     # One graph where all share it: the agents of a frame, in their order.
-    sharing: dict[_Frame, list[int]] = {}
+    sharing: dict[Frame, list[int]] = {}
     for agent, frame in enumerate(frames):
         sharing.setdefault(frame, []).append(agent)
     paths: dict[int, FloatArray] = {}
@@ -137,26 +141,6 @@ def straighten(path: FloatArray, obstacles: FloatArray, distance: FloatArray) ->
     return path[kept]
 
 
-def segment_distance(begin: FloatArray, end: FloatArray, points: FloatArray) -> FloatArray:
-    """Return the distances from segments to points.
-
-    Args:
-        begin: Ends of the segments, shape (..., 2).
-        end: Other ends, shape (..., 2).
-        points: Shape (m, 2).
-
-    Returns:
-        Shape (..., m).
-    """
-    along = (end - begin)[..., None, :]
-    delta = points - begin[..., None, :]
-    length = np.sum(along * along, axis=-1)
-    share = np.sum(delta * along, axis=-1) / np.where(length > 0.0, length, 1.0)
-    nearest = delta - np.clip(share, 0.0, 1.0)[..., None] * along
-    value: FloatArray = np.linalg.norm(nearest, axis=-1)
-    return value
-
-
 def walk(path: FloatArray, progress: FloatArray, sidestep: float = 0.0) -> FloatArray:
     """Return the points of a polyline at shares of its length.
 
@@ -191,104 +175,8 @@ def smooth_progress(time: FloatArray, begin: float, end: float) -> FloatArray:
     return value
 
 
-def search_in_turn(
-    starts: FloatArray,
-    goals: FloatArray,
-    obstacles: FloatArray,
-    distance: FloatArray,
-    pair_distance: float,
-    times: FloatArray,
-    order: IntArray,
-    settings: GridSettings,
-) -> FloatArray:
-    """Guess one agent after the other, each around those before it, by search in space and time.
-
-    Dynamic programming over a coarse grid: least sum of squared steps, with a large price for
-    coming too near. Being agents in priority order, the later ones give way.
-
-    Args:
-        starts: Positions, shape (n, 2) [m].
-        goals: Positions, shape (n, 2) [m].
-        obstacles: Centres, shape (m, 2) [m].
-        distance: To be kept from each centre, shape (m,) [m].
-        pair_distance: To be kept between agents [m].
-        times: Instants of the guess, from 0, shape (k,) [s].
-        order: The agents by priority, shape (n,).
-        settings: The grid.
-
-    Returns:
-        Positions, shape (n, k, 2) [m].
-    """
-    duration = float(times[-1])
-    most = settings.most_search_cells
-    frames = _frames(starts, goals, obstacles, settings.search_cell, settings.border, most)
-    layers = max(2, round(duration / settings.search_period))
-    instants = np.linspace(0.0, duration, layers + 1)
-    found = np.zeros((len(starts), layers + 1, 2))
-    standing: dict[_Frame, FloatArray] = {}
-    for turn, agent in enumerate(order):
-        frame = frames[agent]
-        centres = frame.centres()
-        if frame not in standing:
-            gaps = np.linalg.norm(centres[:, :, None] - obstacles, axis=-1) - distance
-            # Half a cell of leave: the programs that follow polish the guess.
-            least = np.min(gaps, axis=-1, initial=np.inf)
-            standing[frame] = _price(least + 0.5 * frame.cell)
-        prices = np.repeat(standing[frame][None], layers + 1, axis=0)
-        for other in order[:turn]:
-            apart = np.linalg.norm(centres - found[other][:, None, None], axis=-1)
-            prices += _price(apart - pair_distance)
-        source, target = frame.nearest(np.stack([starts[agent], goals[agent]]))
-        cells = _cheapest_chain(prices, int(source), int(target))
-        found[agent] = frame.origin + frame.cell * cells
-        found[agent, 0], found[agent, -1] = starts[agent], goals[agent]
-    return np.stack(
-        [
-            np.stack([np.interp(times, instants, found[agent, :, axis]) for axis in range(2)], -1)
-            for agent in range(len(starts))
-        ]
-    )
-
-
-_STEPS = [(i, j) for i in range(-2, 3) for j in range(-2, 3)]
-
-
-def _price(room: FloatArray) -> FloatArray:
-    """Return what standing at a distance beyond the required one costs, in squared cells."""
-    value: FloatArray = np.where(room < 0.0, 100.0 - 100.0 * room, 0.0)
-    return value
-
-
-def _cheapest_chain(prices: FloatArray, source: int, target: int) -> IntArray:
-    """Return the cells (layers, 2) from source to target of least squared steps plus prices."""
-    layers, rows, columns = prices.shape
-    value = np.full((rows, columns), np.inf)
-    value.flat[source] = 0.0
-    choice = np.zeros((layers, rows, columns), dtype=np.int8)
-    for layer in range(1, layers):
-        padded = np.pad(value, 2, constant_values=np.inf)
-        options = np.stack(
-            [
-                padded[2 - i : 2 - i + rows, 2 - j : 2 - j + columns] + float(i * i + j * j)
-                for i, j in _STEPS
-            ]
-        )
-        choice[layer] = np.argmin(options, axis=0)
-        value = np.min(options, axis=0) + prices[layer]
-    cell = np.array(np.unravel_index(target, (rows, columns)))
-    if not np.isfinite(value[tuple(cell)]):
-        # Too far for the steps of this grid: a straight line.
-        begin = np.array(np.unravel_index(source, (rows, columns)))
-        return np.rint(np.linspace(begin, cell, layers)).astype(np.intp)
-    chain = [cell]
-    for layer in range(layers - 1, 0, -1):
-        cell = cell - np.array(_STEPS[choice[(layer, *cell)]])
-        chain.append(cell)
-    return np.array(chain[::-1])
-
-
 @dataclass(frozen=True, eq=False)
-class _Frame:
+class Frame:
     """Where a grid lies.
 
     Attributes:
@@ -302,7 +190,7 @@ class _Frame:
     cell: float
 
     @classmethod
-    def around(cls, points: FloatArray, cell: float, border: float, most: int) -> _Frame:
+    def around(cls, points: FloatArray, cell: float, border: float, most: int) -> Frame:
         """Return a grid around points (p, 2), with larger cells where there would be too many."""
         low, high = points.min(axis=0) - border, points.max(axis=0) + border
         sides = high - low
@@ -332,20 +220,20 @@ class _Frame:
         return flat
 
 
-def _frames(
+def frames_around(
     starts: FloatArray,
     goals: FloatArray,
     obstacles: FloatArray,
     cell: float,
     border: float,
     most: int,
-) -> list[_Frame]:
+) -> list[Frame]:
     """Return the grid of each agent: one for all, or one of its own where that would be too large.
 
     An agent's own reaches from its start to its goal and around the obstacles there; all of them
     together have no more than `most` cells.
     """
-    whole = _Frame.around(np.vstack([starts, goals, obstacles]), cell, border, most)
+    whole = Frame.around(np.vstack([starts, goals, obstacles]), cell, border, most)
     if whole.cell == cell:
         return [whole] * len(starts)
     frames = []
@@ -353,12 +241,12 @@ def _frames(
         low, high = ends.min(axis=0) - border, ends.max(axis=0) + border
         near = obstacles[np.all((obstacles >= low) & (obstacles <= high), axis=1)]
         share = max(most // len(starts), _FEWEST)
-        frames.append(_Frame.around(np.vstack([ends, near]), cell, border, share))
+        frames.append(Frame.around(np.vstack([ends, near]), cell, border, share))
     return frames
 
 
 def _graph(
-    frame: _Frame,
+    frame: Frame,
     obstacles: FloatArray,
     distance: FloatArray,
     settings: GridSettings,
@@ -369,7 +257,7 @@ def _graph(
     number = np.arange(count).reshape(shape)
     centres = frame.centres()
     rows, columns, lengths = [], [], []
-    for i, j in (s for s in _STEPS if math.gcd(*s) == 1):
+    for i, j in (s for s in STEPS if math.gcd(*s) == 1):
         here = (_overlap(i, shape[0]), _overlap(j, shape[1]))
         there = (_overlap(-i, shape[0]), _overlap(-j, shape[1]))
         step = frame.cell * np.array([i, j], dtype=np.float64)
