@@ -44,8 +44,8 @@ _MOVED = {
     "imitation.spacecraft_flights": "tasks.spacecraft.flights",
     "imitation.spacecraft_policy": "tasks.spacecraft.network_policy",
     "imitation": "learning",
-    "export.spacecraft_c99": "tasks.spacecraft.c99",
-    "export.spacecraft_onnx": "tasks.spacecraft.onnx",
+    "export.spacecraft_c99": "export.c99",
+    "export.spacecraft_onnx": "export.onnx",
 }
 MOVED = {f"lagros_policies.{old}": f"lagros_policies.{new}" for old, new in _MOVED.items()}
 _CARTPOLE = "lagros_policies.tasks.cartpole"
