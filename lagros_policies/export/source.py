@@ -46,7 +46,7 @@ class Source:
     """A policy to export.
 
     Attributes:
-        name: "lagros-cartpole", say.
+        name: Of policy and task, "POLICY-TASK".
         file: Name of the weights file.
         digest: SHA-256 of the weights file, hexadecimal.
         policy: The policy in NumPy.

@@ -27,7 +27,7 @@ TOLERANCE = 1e-5
 def export(
     policy: Annotated[
         str,
-        typer.Argument(help="POLICY-TASK, as in lagros-cartpole; or lagros or learned, and TASK."),
+        typer.Argument(help="lagros or learned, and TASK; or both in one, POLICY-TASK."),
     ],
     task: Annotated[
         str | None,

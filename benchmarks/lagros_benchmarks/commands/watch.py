@@ -67,7 +67,7 @@ def watch(
         float | None, typer.Option(help="End after so many seconds of the episode.")
     ] = None,
 ) -> None:
-    """Watch one episode: agents, thrusters, sensing, tubes, goals, collisions.
+    """Watch one episode: bodies, what they sense, tubes, goals, collisions.
 
     Exit status 3: the policy raised, which ended the episode as a failure.
     """
