@@ -109,10 +109,15 @@ def search(
         if failure is not None:
             return Search(False, seen, time.monotonic() - start, failure)
         late = time.thread_time() - begun > most_seconds or seen >= most_cells
+        # Where no coordinate matters, halves are no better.
+        late = late or not effects.shape[1]
         if late and len(some.lower) + len(rest.lower):
             cell = (some if len(some.lower) else rest)[-1]
             ends = np.stack([cell.lower, cell.upper])
             return Search(False, seen, time.monotonic() - start, undecided=ends)
+        if not len(some.lower):
+            waiting = rest
+            continue
         low, high = _halves(some, effects)
         waiting = Interval(np.concatenate([rest.lower, low]), np.concatenate([rest.upper, high]))
     return Search(True, seen, time.monotonic() - start)
@@ -186,6 +191,8 @@ def _sizes(found: Examined) -> FloatArray:
         size = np.abs(turned @ effect.midpoint @ basis)
         size += np.abs(turned) @ effect.radius @ np.abs(basis)
         norms.append(np.sum(size**2, axis=(-1, -2)))
+    if not norms:
+        return np.zeros((len(values), 0))
     sizes: FloatArray = np.sqrt(np.stack(norms, axis=-1))
     return sizes
 

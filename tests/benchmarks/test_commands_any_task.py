@@ -185,10 +185,13 @@ def test_a_certificate_says_what_is_observed_calibrated_and_not_proved(
     assert result.exit_code == 0, result.output
     words = " ".join(result.stdout.split())
     assert "no tube is certified" in words
-    assert "no proof for measured" in words
+    assert "no tube is certified for measured" in words
     found = json.loads(Path("c.json").read_text())
     kinds = [line["kind"] for line in found["statements"]]
-    assert set(kinds) == {"observed", "calibrated"}
+    # The system is linear and the metric constant: the proof is one inequality.
+    assert kinds.count("proved") == 2
+    assert set(kinds) == {"proved", "observed", "calibrated"}
+    assert len(found["not_proved"]) == 1
     assert found["tube"]["certified"] is None
     assert found["tube"]["observed"] > 0.0
     assert found["region"]["vx"] == [-9.0, 9.0]

@@ -1,7 +1,7 @@
-"""The certificate of one body: what was observed and calibrated, and that nothing is proved.
+"""The certificate of one body: what is proved, calibrated and observed, and what is not proved.
 
-A task whose metric has a proof brings it by the room it has; here, the condition was only counted
-at states that were drawn, and the certificate says so.
+Asked for is the condition on the box of the metric's design, by interval arithmetic; where that is
+not shown in time, the certificate says so, and counts it at states that were drawn.
 """
 
 from __future__ import annotations
@@ -28,11 +28,13 @@ from lagros_benchmarks.worst_case.flights import (
 from lagros_benchmarks.worst_case.seeds import CALIBRATION
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.task import Task
-from lagros_policies.contraction import Samples, load_metric
+from lagros_policies.contraction import BoxRegion, Samples, load_metric
 from lagros_policies.contraction.certificate import Certificate, TubeSizes
 from lagros_policies.contraction.metric import extreme_eigenvalues
-from lagros_policies.contraction.statement import Statement
+from lagros_policies.contraction.statement import Statement, at_most
 from lagros_policies.contraction.theorems import contraction_distance, feasibility_residual
+from lagros_policies.proof.bounds import ProvedBounds
+from lagros_policies.proof.condition import prove
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -99,7 +101,7 @@ class SingleFlights:
 
 
 def certify(task: Task, question: Question) -> Certificate:
-    """Return the certificate of a task whose metric nothing was proved of.
+    """Return the certificate of a task of one body.
 
     Raises:
         UnservedError: The task has no metric, or `largest` is asked for.
@@ -116,7 +118,8 @@ def certify(task: Task, question: Question) -> Certificate:
             "MetricDesign, or --metric a file"
         )
     learned = question.policy != "tube-mpc"
-    lines = [_condition(metric), _feasible(task, metric)]
+    proved, bounds, missing = _proofs(task, metric, question.seconds)
+    lines = [*proved, _condition(metric), _feasible(task, metric)]
     error = recorded_error(task, question.policy) if learned else 0.0
     if learned:
         lines.append(recorded_statement(task, question.policy, task.control_unit))
@@ -128,6 +131,7 @@ def certify(task: Task, question: Question) -> Certificate:
         lines += [line, *calibrated_lines(task, question)]
     # Those of W_bar are the inverses of those of M.
     most, least = (1.0 / value for value in extreme_eigenvalues(metric))
+    gain = sampled_gain(expert_of(task)) if bounds is None else bounds.control_gain
     radius = task.tube_radius(task.time_limit)
     return Certificate(
         task=task.name,
@@ -136,7 +140,7 @@ def certify(task: Task, question: Question) -> Certificate:
         alpha=metric.contraction_rate,
         chi=most / least,
         nu=metric.control_weight / least,
-        b_bar=sampled_gain(expert_of(task)),
+        b_bar=gain,
         epsilon_l=error,
         d_bar=question.bound,
         channels="all",
@@ -144,10 +148,7 @@ def certify(task: Task, question: Question) -> Certificate:
         coefficients=metric.coefficients / least,
         tube=TubeSizes(None if radius is None else float(radius), None, observed),
         statements=tuple(lines),
-        not_proved=(
-            f"no proof for {task.name}: the condition was counted at states that were drawn, and "
-            "no tube is certified",
-        ),
+        not_proved=missing,
     )
 
 
@@ -159,6 +160,32 @@ def region_of(task: Task) -> dict[str, tuple[float, float]]:
     names = task.state_names or tuple(f"x{index}" for index in range(task.system.state_dim))
     ends = zip(design.low, design.high, strict=True)
     return dict(zip((name.partition(" ")[0] for name in names), ends, strict=True))
+
+
+def _proofs(
+    task: Task, metric: Any, most_seconds: float
+) -> tuple[list[Statement], ProvedBounds | None, tuple[str, ...]]:
+    """Return what was proved, or refuted, of the metric on the box of its design; what was not."""
+    missing = f"no tube is certified for {task.name}: its control is held, all states disturbed"
+    begun = time.monotonic()
+    try:
+        if not isinstance(metric.region, BoxRegion):
+            raise ValueError("its metric was not designed on a box")
+        made = prove(task.system, metric, metric.region, most_seconds=most_seconds)
+    except (TypeError, ValueError) as error:
+        return [], None, (f"no proof for {task.name}: {error}", missing)
+    first, bounds = made.statements[0], made.bounds
+    lines = [first] if first.holds or first.refuted else []
+    if bounds is None:
+        missing = f"no proof for {task.name} that W_bar is a metric on the box; {missing}"
+    else:
+        text = (
+            f"I <= W_bar <= {at_most(bounds.condition, 6)} I and ||B|| <= "
+            f"{at_most(bounds.control_gain, 6)} on the box, in the units of the scaling"
+        )
+        lines.append(Statement(text, "proved", True, time.monotonic() - begun - first.seconds))
+    undecided = () if lines[:1] == [first] else (f"no proof for {task.name}: {first.text}",)
+    return lines, bounds, (*undecided, missing)
 
 
 def _condition(metric: Any) -> Statement:
