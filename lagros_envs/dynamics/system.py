@@ -18,8 +18,8 @@ FloatArray = NDArray[np.float64]
 # One entry per coordinate: floats, arrays of a batch, or duals. The physics does not mind which.
 Components = Sequence[Any]
 
-# 16 Gauss-Legendre nodes give A e of the cart-pole to 1e-11 for any two states with |theta| <= 1.5,
-# |rates| <= 4 and |u| <= 60; 8 nodes err by 3e-5 there.
+# 16 Gauss-Legendre nodes give A e of a pole on a cart to 1e-11 for any two states with |theta| <=
+# 1.5, |rates| <= 4 and |u| <= 60; 8 nodes err by 3e-5 there.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _SDC_NODES = 0.5 * (_NODES + 1.0)
 _SDC_WEIGHTS = 0.5 * _WEIGHTS
