@@ -171,6 +171,7 @@ class Learning:
             for each of them.
         epochs: Passes over the data for (c).
         learned_epochs: Likewise for (a).
+        batch: Samples per step.
         rounds: Rounds of DAgger: the network flies, u* says what it should have done.
         round_plans: Episodes of each round.
         round_samples: Labelled states of each round.
@@ -183,6 +184,7 @@ class Learning:
     hidden: tuple[int, ...] = (100, 100, 100)
     epochs: int = 600
     learned_epochs: int = 150
+    batch: int = 512
     rounds: int = 0
     round_plans: int = 1000
     round_samples: int = 50_000

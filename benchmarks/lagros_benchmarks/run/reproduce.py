@@ -96,9 +96,9 @@ class ReproduceSettings:
             "metric": metric_settings(task),
             "data": _algorithm_1(how),
             "rounds": tuple(_round(how, seed) for seed in range(1, how.rounds + 1)),
-            "between": TrainingSettings(how.hidden, how.round_epochs),
-            "lagros": TrainingSettings(how.hidden, how.epochs),
-            "learned": TrainingSettings(how.hidden, how.learned_epochs),
+            "between": TrainingSettings(how.hidden, how.round_epochs, how.batch),
+            "lagros": TrainingSettings(how.hidden, how.epochs, how.batch),
+            "learned": TrainingSettings(how.hidden, how.learned_epochs, how.batch),
             "episodes": task.defaults.episodes,
             "bound": task.defaults.bound,
         }

@@ -67,11 +67,12 @@ class PvtolSettings(Task):
         disturbance_bound=0.3,
         hidden=(64, 64, 128, 128),
         epochs=30,
-        learned_epochs=30,
+        learned_epochs=12,
+        batch=256,
         rounds=3,
-        round_plans=2000,
+        round_plans=2500,
         round_samples=60_000,
-        round_epochs=12,
+        round_epochs=24,
     )
     defaults = Defaults(bounds=(0.3,), bound=0.3)
 
