@@ -35,12 +35,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
+from theorem_one import CertificateTarget, TubeCheck
 from worst_case_tracking import KINDS, SEED, SPACECRAFT_BOUNDS, drawn, spacecraft_case
 
 from lagros_benchmarks.evidence.calibration import pretrained_hash
 from lagros_benchmarks.run.files import plain, write_json
-from lagros_benchmarks.tasks.cartpole.attack import largest_gain
-from lagros_benchmarks.worst_case.certificate import TubeCheck
 from lagros_benchmarks.worst_case.flights import (
     Episodes,
     Law,
@@ -51,7 +50,7 @@ from lagros_benchmarks.worst_case.flights import (
 )
 from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_benchmarks.worst_case.seeds import ATTACK
-from lagros_benchmarks.worst_case.single import CertificateTarget, SingleTarget, energy_adversary
+from lagros_benchmarks.worst_case.single import SingleTarget, energy_adversary
 from lagros_envs.dynamics import hold_step
 from lagros_envs.files import write_atomic
 from lagros_envs.seeding import episode_seeds, episode_streams
@@ -141,7 +140,7 @@ def held_case(policy: str, bound: float) -> dict[str, Any]:
         law = policy_law(LagrosPolicy(expert.task), episodes)
     adversary = energy_adversary(expert.metric)
     target = SingleTarget(episodes, law, "tube", bound, adversary)
-    check = TubeCheck(expert, episodes, bound, largest_gain(expert))
+    check = TubeCheck(expert, episodes, bound)
     rows = {}
     pushes = mixed_pushes(target, _HELD_DRAWS, _HELD_SEARCH)
     aimed = CertificateTarget(episodes, law, "tube", bound, adversary, check)

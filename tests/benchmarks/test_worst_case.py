@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from studies.theorem_one import TubeCheck
 
 import lagros_envs  # noqa: F401
 from lagros_benchmarks.worst_case.attack import AttackSettings, fly_again, run_attack
-from lagros_benchmarks.worst_case.certificate import TubeCheck
 from lagros_benchmarks.worst_case.flights import (
     Episodes,
     Flights,
@@ -293,11 +293,7 @@ def test_a_certificate_that_is_too_small_is_crossed(
     lqr = fly(episodes, policy_law(LqrPolicy(), episodes), every, pushes)
     other = TubeCheck(expert, episodes, 0.05).hold(every, lqr)
     assert (other.certified_radius > 2.0 * honest.certified_radius).all()
-    assert other.observed(0)["learning_error"] > 0.1
-    # What is published of a flight names no certificate: Theorem 1 is not about a held control.
-    certified = {name for name in other.observed(0) if name.startswith("certified")}
-    assert len(certified) == 3
-    assert all(other.observed(0)[name] is None for name in certified)
+    assert (other.learning_error > 0.1).all()
 
 
 def test_an_attack_is_saved_and_flown_again_to_the_last_bit(tmp_path: Path) -> None:

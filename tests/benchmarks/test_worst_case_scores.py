@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from studies.theorem_one import CertificateTarget, TubeCheck
 
 import lagros_envs  # noqa: F401
 import lagros_policies
@@ -24,14 +25,12 @@ from lagros_benchmarks.tasks.spacecraft.plane import plane_target, worst_plane_p
 from lagros_benchmarks.tasks.spacecraft.worst_case import SpacecraftFlights, SpacecraftTarget
 from lagros_benchmarks.worst_case import attack
 from lagros_benchmarks.worst_case.attack import AttackSettings, check_bound, run_attack
-from lagros_benchmarks.worst_case.certificate import TubeCheck
 from lagros_benchmarks.worst_case.flights import Episodes, Flights, draw_episodes, fly, tracking_law
 from lagros_benchmarks.worst_case.goals import GOALS, scores
 from lagros_benchmarks.worst_case.replay import Outcome
 from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_benchmarks.worst_case.seeds import ATTACK, CALIBRATION
 from lagros_benchmarks.worst_case.single import (
-    CertificateTarget,
     SingleTarget,
     energy_adversary,
     replay_single,

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from lagros_benchmarks.evidence.calibration import single_statements
 from lagros_benchmarks.evidence.records import recorded_error, recorded_statement
-from lagros_benchmarks.worst_case.certificate import sampled_gain
 from lagros_benchmarks.worst_case.flights import (
     draw_episodes,
     expert_of,
@@ -26,6 +25,7 @@ from lagros_benchmarks.worst_case.flights import (
     random_pushes,
 )
 from lagros_benchmarks.worst_case.seeds import CALIBRATION
+from lagros_envs.dynamics import control_matrix
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.task import Task
 from lagros_policies.contraction import BoxRegion, Samples, load_metric
@@ -131,7 +131,7 @@ def certify(task: Task, question: Question) -> Certificate:
         lines += [line, *calibrated_lines(task, question)]
     # Those of W_bar are the inverses of those of M.
     most, least = (1.0 / value for value in extreme_eigenvalues(metric))
-    gain = sampled_gain(expert_of(task)) if bounds is None else bounds.control_gain
+    gain = _sampled_gain(task, metric) if bounds is None else bounds.control_gain
     radius = task.tube_radius(task.time_limit)
     return Certificate(
         task=task.name,
@@ -301,3 +301,10 @@ def calibrated_lines(task: Task, question: Question) -> Sequence[Statement]:
     return single_statements(
         task, LEVEL, question.episodes, question.policy, KINDS[0], question.bound
     )
+
+
+def _sampled_gain(task: Task, metric: Any) -> float:
+    """Return b_bar, the largest ||B(x)|| over states drawn from the metric's region (observed)."""
+    drawn = metric.region.sample(np.random.default_rng(0), _CHECKS)
+    matrices = control_matrix(task.system, drawn.state)
+    return float(np.linalg.norm(matrices, ord=2, axis=(1, 2)).max())

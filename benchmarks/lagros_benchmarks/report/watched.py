@@ -24,10 +24,14 @@ class SingleGame:
     """One body and its policy."""
 
     divisible = True  # There are pictures between the control instants.
+    error: str | None = None
+    env: Any
+    _loop: ClosedLoop
+    _pictures: Any = None
 
     def __init__(self, settings: WatchSettings) -> None:
         self._seed = settings.seed
-        self.env: Any = gym.make(
+        self.env = gym.make(
             settings.described.env_id,
             disturbance=settings.disturbance,
             disturbance_bound=settings.disturbance_bound,
@@ -38,8 +42,6 @@ class SingleGame:
         first.rehearse(name, settings.seed)
         # Another one flies: a policy may count its calls without being told.
         self._loop = ClosedLoop(self.env, make_single_policy(settings.policy, self.env))
-        self.error: str | None = None
-        self._pictures: Any = None
 
     def start(self, render_mode: str, rate: float) -> None:
         """Begin the episode, with its plan, and open the window or what draws without one."""
@@ -56,7 +58,7 @@ class SingleGame:
         self.error = attempt.error
         if self.error is not None:
             return True
-        if self._pictures is not None:
+        if self.divisible and self._pictures is not None:
             self._pictures.hold(self._loop.action)
         self._loop.move()
         return self._loop.over

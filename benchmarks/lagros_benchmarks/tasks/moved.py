@@ -57,7 +57,6 @@ _MOVED = {
     "worst_case.spacecraft": "tasks.spacecraft.worst_case",
     "worst_case.plane": "tasks.spacecraft.plane",
     "training.spacecraft": "tasks.spacecraft.training",
-    "training.shipped_ppo": "tasks.cartpole.shipped_ppo",
     "sb3_parallel": "training.sb3_parallel",
     "sb3_vector": "training.sb3_vector",
 }

@@ -14,7 +14,6 @@ from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.episodes import TUBE_TOLERANCE
 from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.library import make_single_policy
-from lagros_benchmarks.worst_case.certificate import TubeCheck
 from lagros_benchmarks.worst_case.flights import (
     Episodes,
     Flights,
@@ -118,31 +117,6 @@ class SingleTarget:
         return pushes
 
 
-@dataclass(frozen=True)
-class CertificateTarget(SingleTarget):
-    """The same flights, scored by what they use of the tube of Theorem 1 while it holds.
-
-    What breaks the tube of success has left the region of the metric by then; this looks for the
-    share that counts.
-
-    Attributes:
-        check: The tube; it must be given.
-    """
-
-    check: TubeCheck | None = None
-
-    @property
-    def slope_cost(self) -> int:
-        """None: the share has a jump where a flight leaves the region."""
-        return 0
-
-    def scores(self, episode: IntArray, sequences: FloatArray) -> FloatArray:
-        """Return the largest share (b,) of the tube under d/d_bar (b, steps, n)."""
-        assert self.check is not None
-        flights = fly(self.flown, self.law, episode, self.bound * sequences)
-        return self.check.hold(episode, flights).certified_share
-
-
 def energy_adversary(metric: ContractionMetric) -> Adversary:
     """Return the feedback that pushes along M e, as the disturbance kind "worst" does."""
 
@@ -198,18 +172,13 @@ class SingleBench:
         )
         self.policy = policy
         # One whose metric is a network is held against the tube of its own.
-        self.expert: Any = self.policy.expert if self.tracks else expert_of(self.task)
+        self.expert = cast(Any, self.policy.expert if self.tracks else expert_of(self.task))
         if self.tracks:
             # A plan that comes late on a busy machine must not change the figure.
             self.policy.deadline = math.inf
         self.episodes = draw_episodes(self.expert, self.settings.episode_seeds())
-        self.certificate = self.check_of()
-
-    def check_of(self) -> TubeCheck | None:
-        """Return the tube of Theorem 1 around the plans; None where the task has no metric."""
-        if self.expert.metric is None:
-            return None
-        return TubeCheck(self.expert, self.episodes, self.settings.bound)
+        if self.expert.metric is not None:
+            self._tracked = self.expert.track(self.episodes.plans, self.episodes.controls)
 
     def law(self) -> Law:
         """Return the policy as a law; for tube MPC u* around its plan, which it confirms."""
@@ -241,11 +210,34 @@ class SingleBench:
             outcome, flight = replay_single(self.episodes, index, self.policy, goal, one)
             if flight is not None:
                 measures = {**outcome.measures, **self.measures(flight)}
-                if self.certificate is not None:
-                    measures |= self.certificate.hold(np.array([index]), flight).observed(0)
+                if self.expert.metric is not None:
+                    measures |= self.of_theorem_one(index, flight)
                 outcome = replace(outcome, measures=measures)
             outcomes.append(outcome)
         return outcomes
+
+    def of_theorem_one(self, index: int, flight: Flights) -> dict[str, float | bool | None]:
+        """Return what a flight of one episode has to do with Theorem 1.
+
+        The largest ||u - u*|| until it left the region of the metric, and whether it never did;
+        what is called certified is None, as no statement of ours is about such a flight.
+        """
+        plans, controls = self.episodes.plans[[index]], self.episodes.controls[[index]]
+        controls = np.concatenate([controls, controls[:, -1:]], axis=1)
+        inside = self.expert.metric.region.contains(flight.states, plans, controls) & flight.alive
+        steps = np.flatnonzero(np.logical_and.accumulate(inside[0])[:-1])
+        error = 0.0
+        if len(steps):
+            which, states = np.full(len(steps), index), flight.states[0, steps]
+            off = flight.controls[0, steps] - self.expert.control(
+                self._tracked, which, steps, states
+            )
+            error = float(np.linalg.norm(off, axis=-1).max())
+        return {
+            "learning_error": error,
+            "in_region": bool(inside.all()),
+            **dict.fromkeys(("certified_share", "certified_crossed", "certified_radius")),
+        }
 
     def measures(self, flight: Flights) -> dict[str, float]:
         """Return further figures of a single flight, by name."""

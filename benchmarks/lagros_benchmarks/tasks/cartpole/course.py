@@ -23,10 +23,6 @@ class CartPoleTraining(SingleTraining):
     task: str = "cartpole"
 
 
-# Ten times as long as that of `lagros train`, and otherwise the same: the shipped `ppo`.
-SHIPPED = CartPoleTraining(segments=40, segment_steps=1800, curve_episodes=500, final_episodes=2000)
-
-
 class CartPoleCourse(SingleCourse):
     """See `SingleCourse`."""
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lagros_benchmarks.report.video import Frame
-from lagros_benchmarks.report.watched import efforts
+from lagros_benchmarks.report.watched import SingleGame, efforts
 from lagros_benchmarks.run import library
-from lagros_benchmarks.run.flying import Attempt, ask, counted, rehearse, reseed
+from lagros_benchmarks.run.closed_loop import ClosedLoop
+from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.tasks.spacecraft.episodes import is_global, make_filter, shapes_of
 from lagros_envs import spacecraft_v0
 from lagros_envs.tasks.spacecraft.draw import SpacecraftRenderer
@@ -20,89 +22,68 @@ if TYPE_CHECKING:
     from lagros_benchmarks.report.playback import WatchSettings
 
 
-class SpacecraftGame:
+class _World(ClosedLoop):
+    """A policy in one of PettingZoo's worlds."""
+
+    def move(self) -> None:
+        """Hold the actions of all agents for one control step."""
+        actions = dict(zip(self.env.agents, self.action, strict=True))
+        self.observation, _, _, _, self.info = self.env.step(actions)
+        self.ended = not self.env.agents
+        self.step += 1
+
+    def seen(self) -> Any:
+        """Return one world, or one row for each agent."""
+        if is_global(self.policy):
+            return self.env.state()[None]
+        return np.stack([self.observation[agent] for agent in self.env.agents])
+
+    def shapes(self) -> Sequence[tuple[int, ...]]:
+        """Return the shapes that its action may have."""
+        return shapes_of(self.policy, 1, self.env.num_agents)
+
+
+class SpacecraftGame(SingleGame):
     """Spacecraft and the policy that flies all of them."""
 
     divisible = False
 
     def __init__(self, settings: WatchSettings) -> None:
         self._settings, self._seed = settings, settings.seed
-        self._scenario = None if settings.scenario is None else Scenario.load(settings.scenario)
-        preset = _preset(settings, self._scenario)
-        bound = settings.disturbance_bound
-        self.env: Any = spacecraft_v0.parallel_env(
+        scenario = None if settings.scenario is None else Scenario.load(settings.scenario)
+        self._options = {} if scenario is None else {"scenario": scenario}
+        preset = _preset(settings, scenario)
+        self.env = spacecraft_v0.parallel_env(
             preset=preset,
             disturbance=settings.disturbance,
-            disturbance_bound=bound,
-        )
-        self._options: dict[str, Any] = (
-            {} if self._scenario is None else {"scenario": self._scenario}
+            disturbance_bound=settings.disturbance_bound,
         )
         # What is seen at the start, for the plan of the whole episode.
-        self._still: Any = spacecraft_v0.parallel_env(preset=preset, settings=self.env.settings)
-        observations, _ = self._still.reset(seed=self._seed, options=self._options)
-        _, policy = self._built()
-        seen = self._seen(policy, self._still, observations)
-        shapes = shapes_of(policy, 1, preset.agents)
-        rehearse(f"policy {settings.policy!r}", policy, seen, np.ones(len(seen), bool), *shapes)
+        self._still = spacecraft_v0.parallel_env(preset=preset, settings=self.env.settings)
+        first = _World(self._still, self._built()[1])
+        first.rehearse(f"policy {settings.policy!r}", self._seed, self._options)
         # Others fly: a policy may count its calls without being told.
-        self._planner, self._policy = self._built()
-        self.error: str | None = None
-        self._state: Any = None
-        self._observations: dict[str, Any] = {}
-        self._infos: dict[str, dict[str, Any]] = {}
-        self._first = True
-        self._pictures: Any = None
+        self._planner, policy = self._built()
+        self._loop = _World(self.env, policy)
 
     def start(self, render_mode: str, rate: float) -> None:
         """Begin the episode, with its plan, and open the window or what draws without one."""
         nominal = self._nominal()
         options = {} if nominal is None else {"nominal": nominal}
-        self._observations, self._infos = self.env.reset(
-            seed=self._seed, options=self._options | options
-        )
+        self._loop.begin(self._seed, self._options | options)
         # Only now: a window would stand still while this plans.
         fps = max(1, round(rate))
         self._pictures = SpacecraftRenderer(render_mode, fps, self.env.preset.arena)
-
-    def step(self) -> bool:
-        """Take a control step; return whether the episode is over."""
-        # One world, or one row for each agent.
-        agents = self.env.agents
-        rows: Any = None
-        with Attempt() as attempt:
-            if self._first:
-                reseed(self._policy, self._seed)
-            rows, self._state = self._ask(
-                self._policy, self.env, self._observations, self._state, self._first
-            )
-        self.error = attempt.error
-        if self.error is not None:
-            return True
-        self._first = False
-        self._observations, _, _, _, self._infos = self.env.step(
-            dict(zip(agents, rows, strict=True))
-        )
-        return not self.env.agents
 
     def draw(self, part: float) -> Frame | None:
         """Draw the world: a frame, or None in a window; of whole control steps only."""
         frame: Frame | None = self._pictures.draw(self.env.episode.world)
         return frame
 
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._pictures is not None:
-            self._pictures.close()
-
-    def counters(self) -> dict[str, int]:
-        """Return what the policy counts."""
-        return counted(self._policy, self._state)
-
     def outcome(self) -> str:
         """Return what the episode came to, in one line."""
-        infos = self._infos.values()
-        count = len(self._infos)
+        infos = self._loop.info.values()
+        count = len(infos)
         arrived = sum(info["success"] for info in infos)
         collided = sum(info["collided"] for info in infos)
         to_success = sum(info["effort_to_success"] for info in infos) / count
@@ -114,22 +95,14 @@ class SpacecraftGame:
 
     def _nominal(self) -> Any:
         """Return x_d (steps + 1, agents, 6) if the policy plans it at the start, else None."""
-        if not is_global(self._policy):
+        if not is_global(self._loop.policy):
             return None
         with Attempt():  # what it raises, it will raise in the episode
-            _, memories = self._ask(self._planner, self._still, {}, None, True)
-            return memories[0].nominal
+            plan = _World(self._still, self._planner)
+            plan.begin(self._seed, self._options)
+            plan.decide()
+            return plan.memory[0].nominal
         return None
-
-    def _ask(
-        self, policy: Any, env: Any, observations: dict[str, Any], state: Any, first: bool
-    ) -> tuple[Any, Any]:
-        """Return the actions, a row for each agent, and the policy's memory."""
-        seen = self._seen(policy, env, observations)
-        starts = np.full(len(seen), first)
-        shapes = shapes_of(policy, 1, env.num_agents)
-        action, state, _ = ask(policy, seen, state, starts, *shapes)
-        return action, state
 
     def _built(self) -> tuple[Any, Any]:
         """Return the policy, and again as it flies, with the filter that it may wear."""
@@ -139,11 +112,6 @@ class SpacecraftGame:
             return policy, policy
         with library.building(f"{name} with the safety filter"):
             return policy, make_filter(policy, self.env, settings.disturbance_bound)
-
-    def _seen(self, policy: Any, env: Any, observations: dict[str, Any]) -> Any:
-        if is_global(policy):
-            return env.state()[None]
-        return np.stack([observations[agent] for agent in env.agents])
 
 
 def _preset(settings: WatchSettings, scenario: Scenario | None) -> Preset:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.run.episodes import TUBE_TOLERANCE
-from lagros_benchmarks.worst_case.flights import Episodes, Flights
+from lagros_benchmarks.worst_case.flights import Episodes, Flights, fly
+from lagros_benchmarks.worst_case.single import SingleTarget
 from lagros_envs.dynamics import control_matrix
 from lagros_policies.contraction import certified_tube
+from lagros_policies.contraction.metric import even_region
+from lagros_policies.tasks.cartpole.expert import CartPoleExpert
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -37,13 +39,6 @@ class Held:
     certified_crossed: BoolArray
     certified_radius: FloatArray
 
-    def observed(self, index: int) -> dict[str, float | bool | None]:
-        """Return the figures of one flight; what is called certified is None (see `claims`)."""
-        return {
-            name: None if name.startswith("certified") else value[index].item()
-            for name, value in vars(self).items()
-        }
-
 
 class TubeCheck:
     """The tube of Theorem 1 around the plans of some episodes, under one bound.
@@ -58,16 +53,13 @@ class TubeCheck:
         expert: The law u* with its metric.
         episodes: The episodes.
         bound: d_bar, in units of the state per second.
-        gain: b_bar, a bound of ||B(x)|| on the region; None to observe it at states drawn there.
     """
 
-    def __init__(
-        self, expert: Any, episodes: Episodes, bound: float, gain: float | None = None
-    ) -> None:
+    def __init__(self, expert: CartPoleExpert, episodes: Episodes, bound: float) -> None:
         """Prepare the plans."""
         self._expert, self._episodes, self._bound = expert, episodes, bound
         self._tracked = expert.track(episodes.plans, episodes.controls)
-        self._gain = sampled_gain(expert) if gain is None else gain
+        self._gain = largest_gain(expert)
 
     def hold(self, episode: IntArray, flights: Flights) -> Held:
         """Hold flights against the tube.
@@ -113,8 +105,34 @@ class TubeCheck:
         return np.asarray(missed.max(axis=1))
 
 
-def sampled_gain(expert: Any, points: int = 10_000) -> float:
-    """Return b_bar, the largest ||B(x)|| over states drawn from the metric's region (observed)."""
-    drawn = expert.metric.region.sample(np.random.default_rng(0), points)
-    matrices = control_matrix(expert.task.system, drawn.state)
-    return float(np.linalg.norm(matrices, ord=2, axis=(1, 2)).max())
+@dataclass(frozen=True)
+class CertificateTarget(SingleTarget):
+    """The same flights, scored by what they use of the tube of Theorem 1 while it holds.
+
+    What breaks the tube of success has left the region of the metric by then; this looks for the
+    share that counts.
+
+    Attributes:
+        check: The tube; it must be given.
+    """
+
+    check: TubeCheck | None = None
+
+    @property
+    def slope_cost(self) -> int:
+        """None: the share has a jump where a flight leaves the region."""
+        return 0
+
+    def scores(self, episode: IntArray, sequences: FloatArray) -> FloatArray:
+        """Return the largest share (b,) of the tube under d/d_bar (b, steps, n)."""
+        assert self.check is not None
+        flights = fly(self.flown, self.law, episode, self.bound * sequences)
+        return self.check.hold(episode, flights).certified_share
+
+
+def largest_gain(expert: CartPoleExpert, points: int = 1001) -> float:
+    """Return b_bar, the largest ||B(x)|| over a grid of the region's angles (observed)."""
+    states = np.zeros((points, 4))
+    states[:, 1] = np.linspace(0.0, even_region(expert.metric)[1], points)
+    matrices = control_matrix(expert.task.system, states)
+    return float(np.linalg.norm(matrices, axis=(1, 2)).max())

@@ -1,6 +1,6 @@
 """The run behind the shipped `ppo`.
 
-    python -m lagros_benchmarks.tasks.cartpole.shipped_ppo --seed 0
+    python benchmarks/tuning/shipped_ppo.py --seed 0
 
 Ten times as long as that of `lagros train cartpole --algo ppo`, and otherwise the same.
 """
@@ -16,9 +16,11 @@ from pathlib import Path
 
 import torch
 
-from lagros_benchmarks.tasks.cartpole.course import SHIPPED
+from lagros_benchmarks.tasks.cartpole.course import CartPoleTraining
 from lagros_benchmarks.training.course import lesson_of
 from lagros_benchmarks.training.run import Place, train
+
+SHIPPED = CartPoleTraining(segments=40, segment_steps=1800, curve_episodes=500, final_episodes=2000)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -28,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         arguments: The arguments; None for those of the process.
     """
     parser = argparse.ArgumentParser(
-        prog="python -m lagros_benchmarks.tasks.cartpole.shipped_ppo",
+        prog="python benchmarks/tuning/shipped_ppo.py",
         description="Train the shipped PPO actor of the cart-pole. Started again after an "
         "interruption, it goes on from the last checkpoint.",
     )
@@ -43,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     run = replace(SHIPPED, seed=options.seed)
     folder = options.out or Path("runs/train/shipped-ppo") / f"seed-{options.seed}"
-    command = f"python -m lagros_benchmarks.tasks.cartpole.shipped_ppo --seed {options.seed}"
+    command = f"python benchmarks/tuning/shipped_ppo.py --seed {options.seed}"
     train(run, Place(folder), lambda: lesson_of(run), command)
 
 
