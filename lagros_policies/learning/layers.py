@@ -3,7 +3,7 @@
 What a task's features say of each disc goes through two layers with one set of weights, beside what
 they say of the body, and the results are added up before the layers that follow. So the network
 learns a disc once, whichever it is. Written out with the weights repeated, it is an ordinary
-multilayer perceptron, and that is what is stored, flown and exported.
+multilayer perceptron, and that is what is flown and exported.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import torch
 
-FloatArray = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 _OWN = 2  # hidden layers of each disc
 
@@ -83,29 +83,33 @@ def outputs_of(
     return answer
 
 
-def network_of(
-    layers: Sequence[torch.nn.Linear], alike: Alike | None
-) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Return weights (inputs, outputs) and biases (outputs,) of the network, written out."""
-    parts = [
-        (layer.weight.detach().numpy().astype(np.float64).T, layer.bias.detach().numpy())
-        for layer in layers
-    ]
-    weights = [weight for weight, _ in parts]
-    biases = [bias.astype(np.float64) for _, bias in parts]
-    if alike is None:
-        return weights, biases
-    count, size = alike
+def written_out(
+    weights: Sequence[Array], biases: Sequence[Array], alike: Alike
+) -> tuple[list[Array], list[Array]]:
+    """Return the layers of the multilayer perceptron that treats things alike.
+
+    Args:
+        weights: Of the two pairs of layers and of those that follow, (inputs, outputs) each.
+        biases: Likewise, (outputs,) each.
+        alike: Which inputs are of things that are alike.
+
+    Raises:
+        ValueError: The shapes do not fit each other.
+    """
+    if len(weights) < 2 * _OWN + 2:
+        raise ValueError(f"{len(weights)} layers must be {2 * _OWN + 2} or more to be written out")
+    things, size = alike
     rest, wide, last = len(weights[1]), len(biases[0]), len(biases[2])
-    first = np.zeros((rest + count * size, (count + 1) * wide))
-    second = np.zeros(((count + 1) * wide, (count + 1) * last))
-    third = np.concatenate([np.tile(weights[4][:last], (count, 1)), weights[4][last:]])
-    for thing in range(count):
+    first = np.zeros((rest + things * size, (things + 1) * wide))
+    second = np.zeros(((things + 1) * wide, (things + 1) * last))
+    third = np.concatenate([np.tile(weights[4][:last], (things, 1)), weights[4][last:]])
+    for thing in range(things):
         to = slice(thing * wide, (thing + 1) * wide)
         first[:rest, to] = weights[0][:rest]
         first[rest + thing * size : rest + (thing + 1) * size, to] = weights[0][rest:]
         second[to, thing * last : (thing + 1) * last] = weights[2]
-    first[:rest, count * wide :], second[count * wide :, count * last :] = weights[1], weights[3]
+    first[:rest, things * wide :] = weights[1]
+    second[things * wide :, things * last :] = weights[3]
     pairs = ((biases[0], biases[1]), (biases[2], biases[3]))
-    tiled = [np.concatenate([np.tile(each, count), own]) for each, own in pairs]
+    tiled = [np.concatenate([np.tile(each, things), own]) for each, own in pairs]
     return [first, second, third, *weights[5:]], [*tiled, *biases[4:]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from lagros_envs.checks import shown
 from lagros_envs.files import write_atomic
 from lagros_envs.reading import check_file
+from lagros_policies.learning.layers import Alike, written_out
 
 Float32Array = NDArray[np.float32]
 Tensors = dict[str, Float32Array]
@@ -21,6 +23,7 @@ Layers = Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
 
 _FORMAT = "lagros-mlp-1"
 _CHECKSUM = "sha256"
+_ALIKE = "alike"  # inputs of things that are alike: how many, and inputs of each
 _LAYER = "layer"
 
 
@@ -34,6 +37,8 @@ class Mlp:
         weights: One matrix (inputs, outputs) per layer.
         biases: One vector (outputs,) per layer.
         metadata: Strings that describe the network; stored beside the weights.
+        alike: Which inputs are of things that are alike; then the layers are those that
+            `written_out` takes, and the file holds these.
 
     Raises:
         ValueError: The shapes do not chain, or a number is not finite.
@@ -44,10 +49,14 @@ class Mlp:
         weights: Sequence[NDArray[np.floating]],
         biases: Sequence[NDArray[np.floating]],
         metadata: dict[str, str] | None = None,
+        alike: Alike | None = None,
     ) -> None:
         """Copy the layers to float32."""
         if not weights or len(weights) != len(biases):
             raise ValueError(f"{len(weights)} weight matrices need as many biases")
+        self._alike, self._stored = alike, list(zip(weights, biases, strict=True))
+        if alike is not None:
+            weights, biases = written_out(weights, biases, alike)
         layers = checked_layers(list(zip(weights, biases, strict=True)))
         self.weights, self.biases = [one for one, _ in layers], [other for _, other in layers]
         self.metadata = dict(metadata or {})
@@ -106,6 +115,9 @@ class Mlp:
         """Write weights and metadata as safetensors, atomically."""
         layers = list(zip(self.weights, self.biases, strict=True))
         metadata = {**self.metadata, "format": _FORMAT, "activation": "tanh"}
+        if self._alike is not None:
+            layers = [(_float32(weight), _float32(bias)) for weight, bias in self._stored]
+            metadata[_ALIKE] = json.dumps(self._alike)
         write_safetensors(path, tensors_of({_LAYER: layers}), metadata)
 
     @classmethod
@@ -123,7 +135,8 @@ class Mlp:
             )
         (layers,) = layers_of(path, tensors, (_LAYER,))
         try:
-            return cls([weight for weight, _ in layers], [bias for _, bias in layers], metadata)
+            weights, biases = [weight for weight, _ in layers], [bias for _, bias in layers]
+            return cls(weights, biases, metadata, _alike(metadata))
         except ValueError as error:
             raise ValueError(f"{path} is damaged: {error}") from error
 
@@ -143,7 +156,7 @@ def checked_layers(layers: Layers, of: str = "") -> list[tuple[Float32Array, Flo
     width = np.shape(layers[0][0])[0] if np.ndim(layers[0][0]) == 2 else -1
     copies = []
     for index, layer in enumerate(layers):
-        weight, bias = (np.array(part, np.float32, order="C") for part in layer)
+        weight, bias = map(_float32, layer)
         if weight.ndim != 2 or weight.shape[0] != width or bias.shape != weight.shape[1:]:
             raise ValueError(
                 f"layer {index}{of} has weights {weight.shape} and biases {bias.shape}, "
@@ -180,6 +193,25 @@ def layers_of(path: Path | str, tensors: Tensors, parts: Sequence[str]) -> list[
     if sorted(tensors) != sorted(name for part in names for layer in part for name in layer):
         raise ValueError(f"{path} holds the tensors {shown(sorted(tensors))}, which are no layers")
     return [[(tensors[weight], tensors[bias]) for weight, bias in part] for part in names]
+
+
+def _float32(values: NDArray[np.floating]) -> Float32Array:
+    return np.array(values, np.float32, order="C")
+
+
+def _alike(metadata: dict[str, str]) -> Alike | None:
+    """Take from the metadata of a file which inputs are of things that are alike.
+
+    Raises:
+        ValueError: It is not said in two whole numbers.
+    """
+    text = metadata.pop(_ALIKE, None)
+    if text is None:
+        return None
+    numbers = re.fullmatch(r"\[([1-9]\d{0,3}), ([1-9]\d{0,3})\]", text)
+    if numbers is None:
+        raise ValueError(f"{_ALIKE}={shown(text)} must be two whole numbers")
+    return Alike(*map(int, numbers.groups()))
 
 
 def write_safetensors(path: Path | str, tensors: Tensors, metadata: dict[str, str]) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lagros_envs.checks import check_each, check_fields, check_positive, check_seed, check_whole
 from lagros_policies.learning.checkpoint import load_values
 from lagros_policies.learning.fitting import Fit, IntArray, one_thread
-from lagros_policies.learning.layers import Alike, network_of, new_layers, outputs_of
+from lagros_policies.learning.layers import Alike, new_layers, outputs_of
 from lagros_policies.learning.networks import Mlp
 
 if TYPE_CHECKING:
@@ -180,12 +180,16 @@ class _Run(Fit[TrainingSettings]):
 
     def network(self) -> Mlp:
         """Return the network with the normalisation folded into its first and last layer."""
-        weights, biases = network_of(self.layers, self.alike)
-        weights[0] = weights[0] / self.input_scale[:, None]
-        biases[0] = biases[0] - self.input_mean @ weights[0]
+        state = [value.detach().numpy().astype(np.float64) for value in self.parameters]
+        weights, biases = [weight.T for weight in state[0::2]], state[1::2]
+        # The first layer; where things are alike, that of each and that of the rest.
+        for index in range(1 if self.alike is None else 2):
+            seen = slice(len(weights[index]))
+            weights[index] = weights[index] / self.input_scale[seen, None]
+            biases[index] = biases[index] - self.input_mean[seen] @ weights[index]
         weights[-1] = weights[-1] @ self.output_units
         biases[-1] = biases[-1] @ self.output_units + self.output_mean
-        return Mlp(weights, biases)
+        return Mlp(weights, biases, alike=self.alike)
 
 
 def _statistics(

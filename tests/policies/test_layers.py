@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from lagros_policies.learning.layers import Alike, network_of, new_layers, outputs_of
-from lagros_policies.learning.networks import Mlp
+from lagros_policies.learning.layers import Alike, new_layers, outputs_of
+from lagros_policies.learning.networks import Mlp, write_safetensors
 from lagros_policies.learning.train import TrainingSettings, fit
 
 ALIKE = Alike(3, 4)
@@ -22,14 +22,23 @@ def inputs(count, rng):
 
 
 @pytest.mark.parametrize("alike", [None, ALIKE])
-def test_written_out_the_network_answers_the_same(alike):
+def test_written_out_the_network_answers_the_same(alike, tmp_path):
     torch.manual_seed(1)
     layers = new_layers(WIDTHS, alike)
     values = inputs(20, np.random.default_rng(0))
     wanted = outputs_of(layers, torch.from_numpy(values), alike).detach().numpy()
-    network = Mlp(*network_of(layers, alike))
+    state = [value.detach().numpy() for layer in layers for value in layer.parameters()]
+    network = Mlp([weight.T for weight in state[0::2]], state[1::2], {"a": "b"}, alike)
     np.testing.assert_allclose(network(values), wanted, atol=2e-6)
     assert (network.inputs, network.outputs) == (WIDTHS[0], WIDTHS[-1])
+    # The file holds the layers of one disc, and gives the same network.
+    file = tmp_path / "network.safetensors"
+    network.save(file)
+    assert file.stat().st_size < 4 * sum(part.size for part in state) + 2000
+    again = Mlp.load(file)
+    assert np.array_equal(again(values), network(values))
+    again.save(tmp_path / "again")
+    assert (tmp_path / "again").read_bytes() == file.read_bytes()
 
 
 def test_order_of_the_discs_does_not_matter_and_their_presence_does(tmp_path):
@@ -71,3 +80,16 @@ def test_too_few_layers_for_discs_are_refused(tmp_path):
             tmp_path / "checkpoint",
             alike=ALIKE,
         )
+
+
+@pytest.mark.parametrize("alike", ["[3]", "[3, 5]", "[0, 4]", "three", "[3, 99999]"])
+def test_a_file_that_says_wrongly_what_is_alike_is_damaged(alike, tmp_path):
+    layers = new_layers(WIDTHS, ALIKE)
+    tensors = {}
+    for index, layer in enumerate(layers):
+        tensors[f"layer{index}.weight"] = layer.weight.detach().numpy().T.copy()
+        tensors[f"layer{index}.bias"] = layer.bias.detach().numpy()
+    metadata = {"format": "lagros-mlp-1", "activation": "tanh", "alike": alike}
+    write_safetensors(tmp_path / "file", tensors, metadata)
+    with pytest.raises(ValueError, match="file is damaged: "):
+        Mlp.load(tmp_path / "file")
