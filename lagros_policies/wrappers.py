@@ -12,6 +12,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from lagros_policies.room import named_in
+
 # Known to change neither observations nor actions, by the package that they come from; the bases
 # leave everything to what a subclass overrides. All others are judged by that.
 HARMLESS: dict[str, frozenset[str]] = {
@@ -156,8 +158,9 @@ def _one_of(vector: str, envs: Iterable[Any], allow_wrappers: bool) -> Any:
     worlds = [bare_environment(env, allow_wrappers) for env in envs]
     first = worlds[0]
     for index, world in enumerate(worlds):
-        for name in ("settings", "preset", "disturbance_bound"):
-            if _told(world, name) != _told(first, name):
+        here, there = _told(world), _told(first)
+        for name in here:
+            if here[name] != there.get(name):
                 raise ValueError(
                     f"the environments 0 and {index} of {vector} differ in their {name}; a policy "
                     "is for one: give it one of the environments"
@@ -165,9 +168,11 @@ def _one_of(vector: str, envs: Iterable[Any], allow_wrappers: bool) -> Any:
     return first
 
 
-def _told(world: Any, name: str) -> Any:
-    """Return what a policy is told of an environment."""
-    return world.disturbance.bound if name == "disturbance_bound" else getattr(world, name, None)
+def _told(world: Any) -> dict[str, Any]:
+    """Return what a policy is told of an environment, by name."""
+    own = named_in(world.settings, "told", None)
+    common = {"settings": world.settings, "disturbance_bound": world.disturbance.bound}
+    return common if own is None else common | own(world, {})
 
 
 def _check(env: Any, inner: Any) -> None:
