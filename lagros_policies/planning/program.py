@@ -110,13 +110,13 @@ class Programs:
         # In units of the largest scale, so that effort and penalty stay comparable in all units.
         self._effort = 2.0 * problem.period * (u_scale / np.max(u_scale)) ** 2
         self._effortless = self._effort * (problem.reference_control / u_scale)
-        low, high = np.empty(self._shape[1]), np.empty(self._shape[1])
-        low[place.states], high[place.states] = problem.state_low, problem.state_high
-        low[place.controls], high[place.controls] = problem.control_low, problem.control_high
-        for bound in (low, high):
-            bound[place.states] /= x_scale
-            bound[place.controls] /= u_scale
-        self._low, self._high = np.maximum(low, -UNBOUNDED), np.minimum(high, UNBOUNDED)
+        # u_k, then x_{k+1}, as in the layout.
+        low = np.concatenate([problem.control_low / u_scale, problem.state_low / x_scale], axis=1)
+        high = np.concatenate(
+            [problem.control_high / u_scale, problem.state_high / x_scale], axis=1
+        )
+        self._low = np.maximum(low.ravel(), -UNBOUNDED)
+        self._high = np.minimum(high.ravel(), UNBOUNDED)
         self._given = problem.given_end
         self._end = place.states[-1][self._given]
 

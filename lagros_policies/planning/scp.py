@@ -142,6 +142,9 @@ class _Iteration:
     def __init__(self, problem: Problem, settings: ScpSettings) -> None:
         self.problem, self.settings = problem, settings
         self.programs = Programs(problem, settings.penalty, settings.disc_reach)
+        self.bounded = (
+            problem.control_low.max() > -math.inf or problem.control_high.min() < math.inf
+        )
         discs = problem.discs
         self.required = None
         if discs is not None and len(discs.centres) > 0:
@@ -278,14 +281,15 @@ class _Iteration:
             following = path[-1]
             required, clearance, short = self._distances(states, np.stack(path))
         later, scale = states[1:], problem.state_scale
-        violation = np.sum(np.abs(following - later) / scale)
-        violation += np.sum(np.maximum(problem.state_low - later, 0.0) / scale)
-        violation += np.sum(np.maximum(later - problem.state_high, 0.0) / scale)
-        # A guess may exceed the bounds of the controls; no program does.
-        beyond = np.maximum(problem.control_low - controls, controls - problem.control_high)
-        violation += np.sum(np.maximum(beyond, 0.0) / problem.control_scale)
-        effort = np.sum((controls - problem.reference_control) ** 2) * problem.period
-        effort /= np.max(problem.control_scale) ** 2
+        violation = (np.abs(following - later) / scale).sum()
+        violation += (np.maximum(problem.state_low - later, 0.0) / scale).sum()
+        violation += (np.maximum(later - problem.state_high, 0.0) / scale).sum()
+        if self.bounded:
+            # A guess may exceed the bounds of the controls; no program does.
+            beyond = np.maximum(problem.control_low - controls, controls - problem.control_high)
+            violation += (np.maximum(beyond, 0.0) / problem.control_scale).sum()
+        effort = ((controls - problem.reference_control) ** 2).sum() * problem.period
+        effort /= problem.control_scale.max() ** 2
         merit = float(effort + self.settings.penalty * (violation + short))
         return _Point(states, controls, following, required, clearance, merit)
 
