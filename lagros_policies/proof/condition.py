@@ -62,8 +62,8 @@ FloatArray = NDArray[np.float64]
 # Cells of one pass: enough to hide NumPy's cost per call, few enough to stay in the cache.
 _BATCH = 100
 _HELD_BATCH = 400
-# Cells along each coordinate that enclose where a hold ends.
-_CELLS = 6
+# Cells that enclose where a hold ends, about.
+_CELLS = 4096
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def prove_hold(
         box: Where x = x_d and u_d lie; its errors are not used.
         contraction_rate: alpha [1/s]; None for that of the metric.
         period: Hold [s].
-        counts: Cells along each coordinate of the set, for where a hold ends; () for six.
+        counts: Cells along each coordinate of the set, for where a hold ends; () for some.
         also: Coordinates whose ends are asked for besides those of the metric.
         most_seconds: Processor time after which the search gives up [s].
 
@@ -242,7 +242,10 @@ def prove_hold(
     check_sizes(system, scaling=(metric.scaling, (system.state_dim,)))
     condition = BoxCondition(where, hold_matrices(system, metric, rate, period, where))
     found = search(condition, _HELD_BATCH, 1_000_000, most_seconds)
-    begun, ended = held_ends(system, where, period, counts or [_CELLS] * len(where.lower))
+    bounded = np.isfinite(where.lower) & (where.lower < where.upper)
+    some = max(int(_CELLS ** (1.0 / max(bounded.sum(), 1))), 1)
+    counts = counts or np.where(bounded, some, 1).tolist()
+    begun, ended = held_ends(system, where, period, counts)
     low, high = np.full((2, system.state_dim), [[-np.inf], [np.inf]])
     for index in metric.coordinates:
         both = begun[index], ended[index]
@@ -294,7 +297,10 @@ def prove(
     held = None
     if period is not None:
         held = prove_hold(system, metric, box, contraction_rate, period, most_seconds=most_seconds)
-        lines.append(held_statement(held, proof.contraction_rate, period, where, "in it"))
+        ends = ", ".join(f"{a:.4g} <= x[{i}] <= {b:.4g}" for i, (a, b) in held.ends.items())
+        lines.append(
+            held_statement(held, proof.contraction_rate, period, where, ends or "anywhere")
+        )
     return Proof(lines, proof, bounds, held)
 
 
@@ -327,30 +333,51 @@ def held_statement(
 
 
 def bounds_statement(
-    system: System, metric: Metric, low: ArrayLike, high: ArrayLike, where: str
+    system: System,
+    metric: Metric,
+    low: ArrayLike,
+    high: ArrayLike,
+    where: str,
+    claimed: float | None = None,
 ) -> tuple[ProvedBounds | None, Statement]:
-    """Prove I <= S W_bar S <= chi I, with the metric's own chi, and b_bar on a box of states."""
+    """Prove I <= S W_bar S <= chi I and b_bar on a box of states.
+
+    Args:
+        system: The system.
+        metric: The metric.
+        low: As in `prove_bounds`.
+        high: As in `prove_bounds`.
+        where: The box in words.
+        claimed: chi, of W_bar as it is; None for the chi that is proved of some multiple of it.
+    """
     start = time.monotonic()
-    claim = f"I <= S W S <= chi I with chi = {at_most(metric.condition_bound, 6)} "
+    claim = "I <= S W S <= chi I with "
+    if claimed is not None:
+        claim += f"chi = {at_most(claimed, 6)} "
     try:
         bounds = prove_bounds(system, metric, low, high)
     except ValueError:
         spent = time.monotonic() - start
-        return None, Statement(f"{claim}for {where}", "proved", False, spent)
-    holds = bounds.least >= 1.0 and bounds.largest <= metric.condition_bound
+        return None, Statement(
+            f"{claim}{'' if claimed else 'some chi '}for {where}", "proved", False, spent
+        )
+    holds = claimed is None or (bounds.least >= 1.0 and bounds.largest <= claimed)
+    if claimed is None:
+        claim += f"chi = {at_most(bounds.condition, 6)}, of a multiple of W, "
     text = f"{claim}and ||B|| <= b_bar = {at_most(bounds.control_gain, 6)} for {where}"
     return bounds, Statement(text, "proved", holds, bounds.seconds)
 
 
 def describe(box: BoxRegion) -> str:
     """Return a box in words."""
-    entries = [
-        f"{low:g} <= x[{index}] <= {high:g}"
-        for index, (low, high) in enumerate(zip(box.low, box.high, strict=True))
-    ]
-    entries += [
-        f"{low:g} <= u_d[{index}] <= {high:g}"
-        for index, (low, high) in enumerate(zip(box.control_low, box.control_high, strict=True))
-    ]
+    parts = [("x", box.low, box.high), ("u_d", box.control_low, box.control_high)]
+    entries, free = [], []
+    for name, lower, upper in parts:
+        for index, (low, high) in enumerate(zip(lower, upper, strict=True)):
+            if np.isfinite(low):
+                entries.append(f"{low:g} <= {name}[{index}] <= {high:g}")
+            else:
+                free.append(f"{name}[{index}]")
     errors = ", ".join(f"{value:g}" for value in box.error)
-    return f"every {', '.join(entries)}, x_d in the same box with |x - x_d| up to ({errors})"
+    rest = f", any {', '.join(free)}" if free else ""
+    return f"every {', '.join(entries)}{rest}, and x_d likewise, |x - x_d| up to ({errors})"

@@ -67,7 +67,8 @@ class ProofSet:
     def cells(self, counts: Sequence[int]) -> Interval:
         """Return cells (k, c): the box at its cuts, and every piece in so many equal parts."""
         ends = []
-        for low, high, cuts, count in zip(self.lower, self.upper, self.cuts, counts, strict=True):
+        for low, high, cuts, most in zip(self.lower, self.upper, self.cuts, counts, strict=True):
+            count = most if low < high else 1
             inner = sorted({cut for cut in cuts if low < cut < high})
             pieces = np.array([low, *inner, high])
             shares = np.arange(count) / count
@@ -140,8 +141,9 @@ def boxed(
     least, largest, far = (np.array(end, dtype=np.float64) for end in (low, high, error))
     ends = [np.array(end, dtype=np.float64) for end in (control_low, control_high)]
     n, near = len(least), 1 if point == "state" else 2
-    same, apart = far == 0.0, (far > 0.0) & ~(far < largest - least)
-    reach = np.minimum(far * _WIDER, largest - least)
+    same = far == 0.0
+    apart = ~same & (~(far < largest - least) | ~np.isfinite(least))
+    reach = np.where(apart, 0.0, far * _WIDER)
 
     def beside(
         between: Sequence[Any], middle: Sequence[FloatArray], share: Sequence[Any]

@@ -223,6 +223,10 @@ def test_the_statements_of_a_small_box_hold_and_those_of_a_bad_metric_do_not(sys
     assert "x_d = x" in good.statements[0].text
     bad = prove_cartpole(thin(proved), box, system)
     assert [part.holds for part in bad.statements] == [False, False]
+    assert bad.statements[0].verdict == "NO"
+    # Time that is up shows nothing.
+    late = prove_cartpole(proved, PROVED_BOX, system, most_seconds=0.0).statements[0]
+    assert (late.holds, late.verdict) == (False, "not shown")
 
 
 def test_other_systems_are_refused(proved):

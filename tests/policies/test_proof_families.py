@@ -1,12 +1,20 @@
 """The families of matrices that are proved definite, for any system, against brute force."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from lagros_envs.dynamics import hold_step
 from lagros_envs.numbers import Interval, exact
 from lagros_envs.tasks.cartpole.physics import CartPole
-from lagros_policies.contraction import Basis, BoxRegion, Metric
+from lagros_envs.tasks.pvtol.physics import Pvtol as Planar
+from lagros_policies.contraction import Basis, BoxRegion, HeldControl, Metric, Samples
+from lagros_policies.contraction.ellipsoid import TubeControl, prove_tube
+from lagros_policies.contraction.held_design import HeldDesign, design_held_contained
+from lagros_policies.contraction.held_ellipsoid import prove_held_tube
+from lagros_policies.contraction.tube_design import PlanBounds, TubeDesign, design_contained
+from lagros_policies.proof.condition import largest_proved, prove, prove_contraction
 from lagros_policies.proof.enclosures import constant
 from lagros_policies.proof.families import (
     BoxCondition,
@@ -19,7 +27,16 @@ from lagros_policies.proof.families import (
 from lagros_policies.proof.sets import Triple as SetTriple
 from lagros_policies.proof.sets import boxed, held_triples, triples
 from lagros_policies.tasks.cartpole.box import ProofBox, balance
-from tests.policies.foreign import Car, Pvtol, Triple, positive, reach, slopes
+from tests.policies.foreign import (
+    Car,
+    Pvtol,
+    Ramp,
+    Triple,
+    brute_residual,
+    positive,
+    reach,
+    slopes,
+)
 
 PVTOL_BOX = BoxRegion(
     (-9.0, -9.0, -0.3, -0.5, -0.4, -0.3),
@@ -221,3 +238,144 @@ def test_the_lifted_condition_is_that_of_brute_force():
         return lifted @ dual + dual @ lifted.T + np.eye(n + m)
 
     check_between_corners(condition, brute, 1e-8)
+
+
+# What is true of other systems.
+
+FREE = np.inf
+CAR = BoxRegion(
+    (-FREE, -FREE, -0.6, 1.0),
+    (FREE, FREE, 0.6, 2.0),
+    (FREE, FREE, 1.2, 1.0),
+    (-1.0,) * 2,
+    (1.0,) * 2,
+)
+CAR_W = [
+    [1.778, -0.039, 0.031, -1.044],
+    [-0.039, 1.809, -0.994, -0.005],
+    [0.031, -0.994, 2.221, 0.029],
+    [-1.044, -0.005, 0.029, 2.406],
+]
+
+
+PLANAR_W = [
+    [6.435, -0.031, 0.042, -4.135, 0.148, -0.283],
+    [-0.031, 1.757, -0.052, -0.127, -2.643, 0.03],
+    [0.042, -0.052, 0.52, 1.129, -0.063, -0.828],
+    [-4.135, -0.127, 1.129, 8.467, -0.32, 0.929],
+    [0.148, -2.643, -0.063, -0.32, 10.371, 0.29],
+    [-0.283, 0.03, -0.828, 0.929, 0.29, 11.84],
+]
+
+
+def car(weight=8.5, rate=0.3):
+    return Metric(np.array([CAR_W]), rate, 4.0, weight, np.ones(4), CAR)
+
+
+def triples_of(box, count, seed):
+    """Return triples of a box, x and x_d anywhere in it, at its faces more often than inside."""
+    rng, ends = np.random.default_rng(seed), (np.array(box.low), np.array(box.high))
+    low, high = (
+        np.where(np.isfinite(end), end, sign) for end, sign in zip(ends, (-1, 1), strict=True)
+    )
+    x, y = (
+        low + np.clip(rng.uniform(-0.3, 1.3, (count, len(low))), 0, 1) * (high - low) for _ in "xy"
+    )
+    least, most = np.array(box.control_low), np.array(box.control_high)
+    share = np.clip(rng.uniform(-0.3, 1.3, (count, len(least))), 0, 1)
+    return Samples(x, y, least + share * (most - least))
+
+
+def test_a_car_is_proved_to_contract_on_a_whole_box():
+    found = prove(Car(), car(), CAR, period=0.1)
+    assert [line.holds for line in found.statements] == [True, True, True]
+    assert "any x[0], x[1]" in found.statements[0].text
+    assert brute_residual(Car(), car(), triples_of(CAR, 300, 0)).max() < 0.0
+    # u* finds contracting controls there.
+    samples = triples_of(CAR, 500, 1)
+    error = 1e-5 * np.random.default_rng(2).standard_normal(samples.state.shape)
+    law = HeldControl(Car(), car(), 0.3, 0.1)
+    a, b, c = law.quadratic(samples.state, samples.state - error, samples.nominal_control)
+    assert np.all(np.einsum("si,sij,sj->s", b, np.linalg.inv(a), b) > c)
+
+
+def test_bad_metrics_of_a_car_are_refused_with_a_point_that_fails():
+    for metric, rate in ((car(weight=0.01), 0.3), (car(), 3.0)):
+        found = prove_contraction(Car(), metric, CAR, rate)
+        point = found.violation
+        assert not found.proved
+        left = left_side(Car(), replace(metric, contraction_rate=rate), point)
+        assert np.linalg.eigvalsh(left)[-1] > 0.0
+    lines = prove(Car(), car(weight=0.01), CAR).statements
+    assert [line.verdict for line in lines] == ["NO", "yes"]
+
+
+def test_the_largest_multiple_of_a_box_is_found():
+    wide = CAR.scaled(2.0)
+    assert wide.low[3] == 0.5
+    assert wide.error == (FREE, FREE, 2.4, 2.0)
+    found = largest_proved(Car(), car(), wide, rounds=3, most_seconds=20.0)
+    assert found.proved
+    assert 0.6 <= found.box.high[2] < 1.2
+
+
+def test_what_a_control_moves_or_nothing_bounds_is_refused():
+    moved = replace(
+        car(), coefficients=np.array([CAR_W, np.zeros((4, 4))]), basis=Basis(("1", "x[3]"))
+    )
+    with pytest.raises(ValueError, match=r"a control of Car.* moves coordinates \(3,\).*nominal"):
+        prove_contraction(Car(), moved, CAR)
+    assert prove_contraction(Car(), replace(moved, point="nominal"), CAR).proved
+    free = replace(
+        CAR, low=(-FREE,) * 3 + (1.0,), high=(FREE,) * 3 + (2.0,), error=(FREE,) * 3 + (1.0,)
+    )
+    with pytest.raises(ValueError, match="not bounded"):
+        prove_contraction(Car(), car(), free)
+    with pytest.raises(ValueError, match=r"low of shape \(4,\)"):
+        prove_contraction(Ramp(), car(), CAR)
+
+
+def test_a_quadrotor_is_proved_to_contract_on_a_whole_box():
+    hover = Planar().hover
+    box = BoxRegion(
+        (-FREE, -FREE, -0.3, -0.5, -0.5, -0.5),
+        (FREE, FREE, 0.3, 0.5, 0.5, 0.5),
+        (FREE, FREE, 0.6, 1.0, 1.0, 1.0),
+        (hover - 0.5,) * 2,
+        (hover + 0.5,) * 2,
+    )
+    metric = Metric(np.array([PLANAR_W]), 0.3, 60.0, 4.0, np.ones(6), box)
+    assert prove_contraction(Planar(), metric, box).proved
+    assert brute_residual(Planar(), metric, triples_of(box, 100, 3)).max() < 0.0
+    fast = prove_contraction(Planar(), metric, box, 0.9)
+    assert fast.violation is not None
+
+
+def test_a_tube_of_a_car_is_designed_proved_and_kept():
+    """An invariant ellipsoid that keeps the car in the box of its own condition."""
+    plans = PlanBounds((-FREE, -FREE, -0.2, 1.2), (FREE, FREE, 0.2, 1.8), (-0.3,) * 2, (0.3,) * 2)
+    tube = design_contained(Car(), plans, TubeDesign(rate=0.5, disturbance_bound=0.1))
+    assert prove_tube(Car(), tube).proved
+    wider = replace(tube, design=replace(tube.design, disturbance_bound=0.2))
+    assert not prove_tube(Car(), wider).proved
+    control = TubeControl(Car(), tube)
+    rng = np.random.default_rng(5)
+    nominal = np.tile([0.0, 0.0, 0.1, 1.5], (200, 1))
+    state, u_d, step = nominal.copy(), np.zeros((200, 2)), 0.02
+    push = rng.standard_normal((200, 4))
+    for _ in range(100):
+        push = push + 0.3 * rng.standard_normal((200, 4))
+        force = 0.1 * push / np.linalg.norm(push, axis=1, keepdims=True)
+        state = hold_step(Car(), state, control(state, nominal, u_d), step, force, substeps=1)
+        nominal = hold_step(Car(), nominal, u_d, step, substeps=1)
+        assert np.all(np.abs(state - nominal) <= tube.steady_outputs)
+
+
+@pytest.mark.slow
+def test_a_tube_of_a_held_car_is_designed_and_proved():
+    plans = PlanBounds((-FREE, -FREE, -0.2, 1.2), (FREE, FREE, 0.2, 1.8), (-0.3,) * 2, (0.3,) * 2)
+    design = HeldDesign(0.1, 0.5, disturbance_bound=0.1, degree=3, control_unit=1.0)
+    tube = design_held_contained(Car(), plans, design)
+    assert prove_held_tube(Car(), tube).proved
+    wider = replace(tube, design=replace(design, disturbance_bound=0.2))
+    assert not prove_held_tube(Car(), wider).proved

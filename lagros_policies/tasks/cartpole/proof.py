@@ -56,7 +56,9 @@ def prove_cartpole(
     check_cartpole_metric(metric, "prove_cartpole")
     proof = prove_contraction(system, metric, box, contraction_rate, most_seconds=most_seconds)
     half = angle_box(box.angle)
-    bounds, line = bounds_statement(system, metric, *half, f"every |theta| <= {box.angle:g} rad")
+    bounds, line = bounds_statement(
+        system, metric, *half, f"every |theta| <= {box.angle:g} rad", metric.condition_bound
+    )
     lines = [contraction_statement(proof, metric, describe(box)), line]
     if held_box is None:
         return Proof(lines, proof, bounds)
