@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from lagros_policies.expert import Expert, TrackedPlans
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.learning.rounds import met_states, padded_discs
 from lagros_policies.learning.shards import Shard, make_shards
-from lagros_policies.planning import Trajectory
+from lagros_policies.planning import PlannerSettings, Trajectory
 from lagros_policies.room import task_of
 
 FloatArray = NDArray[np.float64]
@@ -185,6 +185,9 @@ def make_shard(
 ) -> Shard:
     """Generate one shard: plan, fill the tubes, keep the verified region, label."""
     expert = Expert(task, metric)
+    if network is not None and isinstance(expert.planner.settings, PlannerSettings):
+        # Where a network went wrong there is often no way; other guesses find none either.
+        expert.planner.settings = replace(expert.planner.settings, attempts=1)
     count = settings.plans // settings.shards
     seeds = episode_seeds(settings.seed, settings.plans)[index * count : (index + 1) * count]
     episodes = [task.sample(episode_streams(seed).scenario) for seed in seeds]
