@@ -49,12 +49,15 @@ _MOVED = {
 }
 MOVED = {f"lagros_policies.{old}": f"lagros_policies.{new}" for old, new in _MOVED.items()}
 _CARTPOLE = "lagros_policies.tasks.cartpole"
+_SPACECRAFT = "lagros_policies.tasks.spacecraft"
 # As in `lagros_envs.tasks.moved`.
 NAMES = {
     "lagros_policies.contraction.feedback": "lagros_policies.tasks.cartpole.feedback",
     "lagros_policies.policy": {"SPACECRAFT_NAMES": "lagros_policies.tasks.spacecraft"},
     "lagros_policies.expert": "lagros_policies.tasks.cartpole.expert",
     "lagros_policies.safety": "lagros_policies.tasks.spacecraft.safety_filter",
+    "lagros_policies.learned": {"SpacecraftLearnedPolicy": f"{_SPACECRAFT}.network_policy"},
+    "lagros_policies.lagros": {"SpacecraftLagrosPolicy": f"{_SPACECRAFT}.network_policy"},
     "lagros_policies.contraction": {"Region": f"{_CARTPOLE}.region"},
     "lagros_policies.contraction.regions": {"Region": f"{_CARTPOLE}.region"},
     "lagros_policies.contraction.tube_design": {"PlanBox": f"{_CARTPOLE}.plans"},

@@ -11,6 +11,7 @@ import lagros_policies.tasks.moved
 from lagros_benchmarks.tasks import moved as moved_benchmarks
 
 FILTER = "lagros_policies.tasks.spacecraft.safety_filter"
+NETWORKS = "lagros_policies.tasks.spacecraft.network_policy"
 SLIDING = "lagros_policies.tasks.spacecraft.sliding"
 TABLE = {
     **lagros_envs.tasks.moved.MOVED,
@@ -75,6 +76,8 @@ def test_modules_of_a_package_that_has_moved_are_not_imported_twice():
         ("lagros_envs.dynamics", "Spacecraft", "lagros_envs.tasks.spacecraft.physics"),
         ("lagros_policies.expert", "CartPoleExpert", "lagros_policies.tasks.cartpole.expert"),
         ("lagros_policies.safety", "SafetyFilter", FILTER),
+        ("lagros_policies.learned", "SpacecraftLearnedPolicy", NETWORKS),
+        ("lagros_policies.lagros", "SpacecraftLagrosPolicy", NETWORKS),
         ("lagros_policies.tasks.cartpole.remarks", "SlidingCentralizedPolicy", SLIDING),
         ("lagros_policies.remarks.lagrangian", "SlidingTracking", SLIDING),
         ("lagros_benchmarks.report", "print_report", "lagros_benchmarks.report.delivery"),
