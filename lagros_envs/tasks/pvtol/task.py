@@ -117,13 +117,12 @@ class PvtolSettings(Task):
         return abs(state[2]) - math.pi / 2.0
 
     def outline(self, state: FloatArray) -> Sequence[FloatArray]:
-        """Return the rod and the two rotors."""
+        """Return the rod and the two rotors, within the circle that collides."""
         place, roll = state[:2], state[2]
         along = np.array([math.cos(roll), math.sin(roll)])
         across = np.array([-along[1], along[0]])
-        arm, thin, blade = self.system.arm, 0.02, 0.09
-        parts = [(-arm, arm, -thin, thin)]
-        parts += [(end - blade, end + blade, 0.04, 0.06) for end in (-arm, arm)]
+        half = self.body_radius
+        parts = [(-half, half, -0.02, 0.02), (-half, -0.05, 0.04, 0.06), (0.05, half, 0.04, 0.06)]
         return [
             np.stack(
                 [
