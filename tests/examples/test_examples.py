@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lagros_policies.contraction import Basis, BoxRegion, CvStemSettings, design_metric
 from lagros_policies.export import check as check_export
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -44,9 +45,11 @@ def check(before, after, returns, episodes):
 
 
 def test_every_example_is_tested_and_says_how_it_is_run():
-    names = sorted(path.stem for path in EXAMPLES.glob("*.py"))
+    # The car is a task, with tests of its own.
+    names = sorted(path.stem for path in EXAMPLES.glob("*.py") if path.stem != "car")
     assert names == [
         "cleanrl_ppo_cartpole",
+        "metric_in_cvxpy",
         "planner_in_cvxpy",
         "rllib_ppo_spacecraft",
         "skrl_ppo_cartpole",
@@ -56,6 +59,22 @@ def test_every_example_is_tested_and_says_how_it_is_run():
     for name in names:
         assert f"python examples/{name}.py" in (EXAMPLES / f"{name}.py").read_text()
         assert f"examples/{name}.py" in guide
+
+
+def test_the_metric_in_cvxpy_is_that_of_the_quick_program_and_proved(example, capsys):
+    pytest.importorskip("cvxpy", reason="the extra `train` is not installed")
+    module = example("metric_in_cvxpy")
+    box = BoxRegion(
+        (0.0, 0.0, -0.5, 1.0), (1.0, 1.0, 0.5, 2.0), (0.5,) * 4, (-1.0,) * 2, (1.0,) * 2
+    )
+    samples, place = box.sample(np.random.default_rng(1), 30), np.zeros((1, 4))
+    program, _, nu, chi = module.cvstem(module.Car(), samples, Basis(("1",)), 0.2, 0.1, place)
+    program.solve(solver="CLARABEL")
+    quick = design_metric(module.Car(), samples, box, CvStemSettings(0.2, 0, 0.1, 0.0))
+    assert quick.condition_bound == pytest.approx(float(chi.value), rel=1e-3)
+    assert quick.control_weight == pytest.approx(float(nu.value), rel=1e-3)
+    module.main()
+    assert [line[:5] for line in capsys.readouterr().out.splitlines()] == ["yes: "] * 3
 
 
 # What tests all over the project are skipped without; the extra `all` brings it.
