@@ -148,6 +148,19 @@ def test_what_a_task_of_one_body_lacks_is_said(invoke: Any) -> None:
         assert message in result.output
 
 
+@pytest.mark.parametrize("task", ["pvtol", Path(__file__).parents[2] / "examples" / "car.py"])
+def test_the_quadrotor_and_the_car_are_served_alike(task: Any, invoke: Any) -> None:
+    result = invoke("watch", task, "--policy", "lqr", "--seconds", 0.5, "--video", "a.gif")
+    assert result.exit_code == 0, result.output
+    assert "lqr on seed 0, uniform" in result.output
+    quick = ("--policy", "lqr", "--episodes", 1, "--budget", 30, "--goal", "tube")
+    result = invoke("attack", task, *quick, "--json", "a.json")
+    assert result.exit_code == 0, result.output
+    row = json.loads(Path("a.json").read_text())
+    assert row["score_worst"] >= row["search_scores"][0] - 1e-3
+    assert row["outcomes"][0]["measures"]["left_paper_tube"] is None
+
+
 # With a metric
 
 

@@ -144,6 +144,8 @@ def _train_one(
     from lagros_benchmarks.training.run import Place
     from lagros_benchmarks.training.run import train as train_run
     from lagros_benchmarks.training.table import final_table
+    from lagros_envs.registry import find_task
+    from lagros_policies.room import shipped_file
 
     # One thread: networks this small gain nothing from more, and the sums stay reproducible.
     torch.set_num_threads(1)
@@ -160,6 +162,9 @@ def _train_one(
         ) from error
     typer.echo(f"{place.weights}, on held-out episodes:")
     Console(highlight=False).print(table)
+    name = run.algorithm.name if residual is None else "residual"
+    home = shipped_file(find_task(run.task), f"{name}.safetensors")
+    typer.echo(f"copied to {home}, they fly as the policy {name!r}")
     return record
 
 
