@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from studies.coverage import check_coverage, split_coverage
 
 from lagros_benchmarks.evidence.calibration import (
     EpisodeScores,
@@ -36,12 +37,7 @@ from lagros_benchmarks.tasks.spacecraft.calibration import POSITION_ERROR, space
 from lagros_benchmarks.worst_case.seeds import CALIBRATION, VERIFICATION
 from lagros_envs.files import write_atomic
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
-from lagros_policies.contraction.conformal import (
-    check_coverage,
-    conformal_bound,
-    coverage_interval,
-    split_coverage,
-)
+from lagros_policies.contraction.conformal import conformal_bound, coverage_interval
 
 COMMAND = "python benchmarks/studies/conformal.py"
 FOLDER = Path("runs/conformal")

@@ -70,16 +70,13 @@ def condition_terms(system: System, samples: Samples) -> tuple[FloatArray, Float
     return slope, control_matrix(system, state), motion
 
 
-def condition_left(
-    system: System, metric: DualMetric, samples: Samples, share: float = 1.0
-) -> FloatArray:
-    """Return -dW_bar/dt + 2 sym(A W_bar) - 2 share nu B B' + 2 alpha W_bar at samples, (s, n, n).
+def condition_left(system: System, metric: DualMetric, samples: Samples) -> FloatArray:
+    """Return -dW_bar/dt + 2 sym(A W_bar) - 2 nu B B' + 2 alpha W_bar at samples, (s, n, n).
 
     Args:
         system: The system.
         metric: The metric.
         samples: Where.
-        share: Of the gain B'M of Theorem 2's proof, whose own is one.
 
     Raises:
         ValueError: The three are not of one system.
@@ -96,7 +93,7 @@ def condition_left(
         -metric.dual_rate(place, motion)
         + product
         + np.swapaxes(product, -1, -2)
-        - 2.0 * share * metric.control_weight * gain @ np.swapaxes(gain, -1, -2)
+        - 2.0 * metric.control_weight * gain @ np.swapaxes(gain, -1, -2)
         + 2.0 * metric.contraction_rate * dual
     )
     return left

@@ -267,17 +267,6 @@ def planned_margin(margin: float | None, disturbance_bound: float, rate: float) 
     return margin
 
 
-def rate_for_margin(disturbance_bound: float, margin: float) -> float:
-    """Return the least alpha [1/s] whose expected margin is at most the margin [m].
-
-    Raises:
-        ValueError: The margin is not positive or the bound negative.
-    """
-    check_positive("margin", margin)
-    check_not_negative("disturbance_bound", disturbance_bound)
-    return float((_EXPECTED_ERROR * disturbance_bound / margin) ** (1.0 / _EXPECTED_POWER))
-
-
 def flow(time: float) -> FloatArray:
     """Return F(t) = exp(A t) of the double integrator, shape (2, 2)."""
     return np.array([[1.0, time], [0.0, 1.0]])

@@ -83,11 +83,14 @@ def cone_rows(
     return np.hstack([dual, weight, condition])
 
 
-def solve_cones(program: ConeProgram) -> tuple[FloatArray | None, str]:
+def solve_cones(
+    program: ConeProgram, tolerance: float | None = None
+) -> tuple[FloatArray | None, str]:
     """Solve a program with Clarabel, in one thread.
 
     Args:
         program: The program.
+        tolerance: Of the gap; None for the solver's own.
 
     Returns:
         z, shape (z,), or None where it was not found, and the solver's status.
@@ -95,11 +98,15 @@ def solve_cones(program: ConeProgram) -> tuple[FloatArray | None, str]:
     import clarabel
 
     cones = [clarabel.PSDTriangleConeT(program.n)] * program.cones
-    return solve_conic(program.cost, program.rows, program.right, cones)
+    return solve_conic(program.cost, program.rows, program.right, cones, tolerance)
 
 
 def solve_conic(
-    cost: FloatArray, rows: sparse.csc_matrix, right: FloatArray, cones: Sequence[Any]
+    cost: FloatArray,
+    rows: sparse.csc_matrix,
+    right: FloatArray,
+    cones: Sequence[Any],
+    tolerance: float | None = None,
 ) -> tuple[FloatArray | None, str]:
     """Minimise cost'z subject to right - rows z in a product of cones, in one thread.
 
@@ -110,6 +117,7 @@ def solve_conic(
         rows: Shape (entries of all cones, z).
         right: Shape (entries of all cones,).
         cones: Clarabel's, in the order of the rows.
+        tolerance: Of the gap; None for the solver's own.
 
     Returns:
         z, shape (z,), or None where it was not found, and the solver's status.
@@ -119,6 +127,8 @@ def solve_conic(
     settings: Any = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
+    if tolerance is not None:
+        settings.tol_gap_abs = settings.tol_gap_rel = tolerance
     quadratic = sparse.csc_matrix((cost.size, cost.size))
     answer = clarabel.DefaultSolver(quadratic, cost, rows, right, cones, settings).solve()
     status = str(answer.status)

@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from lagros_envs.aliases import moved_names
 from lagros_envs.checks import check_not_negative
 from lagros_envs.dynamics import System, control_matrix
-from lagros_policies.contraction.condition import Samples, condition_left
+from lagros_policies.contraction.condition import Samples
 from lagros_policies.contraction.control import contraction_terms
-from lagros_policies.contraction.metric import DualMetric, Metric, metric_place
+from lagros_policies.contraction.metric import Metric, metric_place
 
 __getattr__ = moved_names(__name__)
 FloatArray = NDArray[np.float64]
@@ -48,26 +48,6 @@ def disturbed_rate(metric: Metric, drift: float, angle_disturbance: float) -> fl
     check_not_negative("drift", drift)
     check_not_negative("angle_disturbance", angle_disturbance)
     return metric.contraction_rate - 0.5 * drift * angle_disturbance
-
-
-def gain_residual(
-    system: System, metric: DualMetric, samples: Samples, share: float = 1.0
-) -> FloatArray:
-    """Return the largest eigenvalue of Theorem 2's condition for K = -share B'M, shape (s,).
-
-    Of -dW_bar/dt + 2 sym(A W_bar) - 2 share nu B B' + 2 alpha W_bar, relative to the trace of
-    W_bar: a share of 1 is equation (14), a share of 1/2 the display in its proof.
-
-    Args:
-        system: The system.
-        metric: The metric.
-        samples: Where to look.
-        share: s.
-    """
-    left = condition_left(system, metric, samples, share)
-    dual = metric.dual(metric_place(metric, samples.state, samples.nominal))
-    worst = np.linalg.eigvalsh(left)[:, -1] / np.trace(dual, axis1=-2, axis2=-1)
-    return np.asarray(worst, dtype=np.float64)
 
 
 def feasibility_residual(system: System, metric: Metric, samples: Samples) -> FloatArray:

@@ -1,16 +1,14 @@
-"""What is decided of matrices of intervals: products, Jacobians over boxes, definiteness."""
+"""What is decided of matrices of intervals: products and definiteness."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.dynamics import System
-from lagros_envs.numbers import Interval, dual, functions
-from lagros_envs.numbers.interval import ends, ordered
+from lagros_envs.numbers import Interval
+from lagros_envs.numbers.interval import ordered
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -20,39 +18,6 @@ BoolArray = NDArray[np.bool_]
 _PRODUCT_ERROR = 64 * 2.0**-52
 # The sums and products of the test itself; a bound this near to failing counts as failed.
 _SLACK = 1e-9
-
-
-def interval_jacobian(
-    system: System, state: Interval, control: Interval
-) -> tuple[Interval, Interval]:
-    """Enclose d(f + Bu)/dx and B over boxes of states and controls.
-
-    Args:
-        system: The system.
-        state: Boxes of x, shape (..., n).
-        control: Boxes of u, shape (..., m); broadcast against the state.
-
-    Returns:
-        Enclosures of d(f + Bu)/dx, shape (..., n, n), and of B(x), shape (..., n, m).
-    """
-    n, m = system.state_dim, system.control_dim
-    shape = np.broadcast_shapes(state.shape[:-1], control.shape[:-1])
-    zero = np.zeros(shape)
-    # Sums with zeros would round: broadcast the ends themselves.
-    parts: list[Any] = [
-        ordered(part.lower[..., index] + zero, part.upper[..., index] + zero)
-        for part, count in ((state, n), (control, m))
-        for index in range(count)
-    ]
-    seeds = dual.seed(parts)
-    lower, upper = np.zeros((*shape, n, n + m)), np.zeros((*shape, n, n + m))
-    for row, rate in enumerate(system.derivative(seeds[:n], seeds[n:], functions)):
-        if isinstance(rate, dual.Dual):
-            low, high = ends(rate.gradient)
-            lower[..., row, :] = np.moveaxis(np.asarray(low), 0, -1)
-            upper[..., row, :] = np.moveaxis(np.asarray(high), 0, -1)
-    full = Interval(lower, upper)
-    return full[..., :n], full[..., n:]
 
 
 def matmul(left: Interval, right: Interval) -> Interval:

@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from studies.coverage import check_coverage, split_coverage
 
 from lagros_policies.contraction.conformal import (
     ConformalBound,
     bound_statement,
-    check_coverage,
     confident_rank,
     conformal_bound,
     coverage_interval,
     rank_for,
-    split_coverage,
 )
 
 

@@ -75,6 +75,14 @@ def test_slopes_are_the_oracles_and_over_cells_enclose_those_inside(oracle, syst
     np.testing.assert_allclose(gain.parts[0].midpoint, oracle.input_matrix(point[:, :4]))
     assert slope.parts[0].radius.max() < 1e-8
     wide = [variable(Interval(part - 0.01, part + 0.01), 2) for part in point.T]
+    for _ in range(20):
+        inside = point + rng.uniform(-0.01, 0.01, point.shape)
+        full = oracle.jacobian(lambda z: oracle.rates(z[..., :4], z[..., 4:]), inside)
+        for found, true in zip(
+            slopes(system, wide[:4], wide[4:]), np.split(full, [4], -1), strict=True
+        ):
+            part = found.parts[0]
+            assert np.all(Interval(part.lower - 1e-9, part.upper + 1e-9).contains(true))
     for whole, part in zip(slopes(system, wide[:4], wide[4:]), (slope, gain), strict=True):
         for order in range(3):
             assert np.all(whole.parts[order].lower <= part.parts[order].upper)

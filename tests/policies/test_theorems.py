@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from lagros_policies.contraction import Samples
+from lagros_policies.contraction.condition import condition_left
 from lagros_policies.contraction.theorems import (
     contraction_distance,
     disturbed_rate,
     feasibility_residual,
-    gain_residual,
     tube_ball,
     tube_ellipsoid,
 )
@@ -129,6 +129,14 @@ def test_few_cells_make_the_lipschitz_constant_larger_not_smaller(system, oracle
 def test_a_box_with_a_lean_is_refused(system):
     with pytest.raises(ValueError, match="lean"):
         lipschitz_constant(system, replace(ProofBox(0.3, 1.0, 1.0, 1.0), lean=1.0))
+
+
+def gain_residual(system, metric, samples, share=1.0):
+    """Theorem 2's condition for K = -share B'M, over the trace: 1/2 is the display in its proof."""
+    weighed = replace(metric, control_weight=share * metric.control_weight)
+    left = condition_left(system, weighed, samples)
+    dual = metric.dual(samples.state)
+    return np.linalg.eigvalsh(left)[:, -1] / np.trace(dual, axis1=-2, axis2=-1)
 
 
 @pytest.mark.parametrize("share", [0.5, 1.0, 2.0])

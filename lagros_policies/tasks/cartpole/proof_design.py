@@ -19,11 +19,11 @@ from lagros_envs.files import write_atomic
 from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.metric_files import metric_record
+from lagros_policies.contraction.regions import Samples, joined
 from lagros_policies.proof.condition import Proof
 from lagros_policies.proof.families import Violation
 from lagros_policies.tasks.cartpole.proof import prove_cartpole
 from lagros_policies.tasks.cartpole.proof_program import (
-    Points,
     ProvedDesignSettings,
     corners,
     design_on_points,
@@ -47,7 +47,7 @@ def design_proved(
         RuntimeError: The last metric could not be proved.
     """
     settings, system = settings or ProvedDesignSettings(), system or CartPole()
-    pool = corners(system, settings.box).joined(corners(system, settings.leaning))
+    pool = joined(corners(system, settings.box), corners(system, settings.leaning))
     held = corners(system, settings.leaning, angles=13, rates=5)
     for _ in range(settings.rounds):
         metric = design_on_points(system, pool, held, settings)
@@ -68,9 +68,9 @@ def design_proved(
             # Nothing failed: the proofs ran out of time, and would again.
             break
         for point in found:
-            pool = pool if point is None else pool.joined(_around(point))
+            pool = pool if point is None else joined(pool, _around(point))
         if over is not None:
-            held = held.joined(_around(over))
+            held = joined(held, _around(over))
     missed = [part.text for part in (*proof.statements, *second.statements) if not part.holds]
     raise RuntimeError(
         f"not proved after at most {settings.rounds} designs: {'; '.join(missed)}. Raise the "
@@ -78,8 +78,8 @@ def design_proved(
     )
 
 
-def _around(point: Violation) -> Points:
-    return Points(point.state[None], point.nominal[None], point.control[None])
+def _around(point: Violation) -> Samples:
+    return Samples(point.state[None], point.nominal[None], point.control[None])
 
 
 def write_proved(

@@ -22,9 +22,11 @@ from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY, Ca
 from lagros_policies.contraction.basis import cosine_powers, cosine_rates
 from lagros_policies.contraction.cvstem import CvStemSettings, InfeasibleError
 from lagros_policies.contraction.metric import Metric
+from lagros_policies.contraction.regions import Samples
 from lagros_policies.contraction.semidefinite import (
     ConeProgram,
     cone_rows,
+    solve_cones,
     svec,
     symmetric_basis,
 )
@@ -86,34 +88,7 @@ class ProvedDesignSettings:
         return np.array(self.cvstem.scaling or Region.scaling)
 
 
-@dataclass(frozen=True)
-class Points:
-    """Points at which a condition is imposed.
-
-    Attributes:
-        state: x, shape (s, 4).
-        other: y, shape (s, 4).
-        control: u_d, shape (s, 1).
-    """
-
-    state: FloatArray
-    other: FloatArray
-    control: FloatArray
-
-    def take(self, index: NDArray[np.intp]) -> Points:
-        """Return the points with these indices."""
-        return Points(self.state[index], self.other[index], self.control[index])
-
-    def joined(self, other: Points) -> Points:
-        """Return these points and others."""
-        return Points(
-            np.concatenate([self.state, other.state]),
-            np.concatenate([self.other, other.other]),
-            np.concatenate([self.control, other.control]),
-        )
-
-
-def corners(system: CartPole, box: ProofBox, angles: int = 21, rates: int = 5) -> Points:
+def corners(system: CartPole, box: ProofBox, angles: int = 21, rates: int = 5) -> Samples:
     """Return points of a box: a grid of angles and rates, the ends of rate of x and force.
 
     Args:
@@ -144,11 +119,11 @@ def corners(system: CartPole, box: ProofBox, angles: int = 21, rates: int = 5) -
     state[:, ANGLE], state[:, ANGULAR_RATE] = table[:, 0], table[:, 1]
     nominal[:, ANGLE], nominal[:, ANGULAR_RATE] = table[:, 2], table[:, 3]
     nominal[:, VELOCITY] = state[:, VELOCITY] = table[:, 4]
-    return Points(state, nominal, table[:, 5:])
+    return Samples(state, nominal, table[:, 5:])
 
 
 def design_on_points(
-    system: CartPole, pool: Points, held: Points, settings: ProvedDesignSettings
+    system: CartPole, pool: Samples, held: Samples, settings: ProvedDesignSettings
 ) -> Metric:
     """Solve programs over the points that bind until all points are satisfied.
 
@@ -188,11 +163,11 @@ def _failing(worst: FloatArray) -> NDArray[np.intp]:
 
 
 def _rate_blocks(
-    system: CartPole, pool: Points, settings: ProvedDesignSettings, margin: float
+    system: CartPole, pool: Samples, settings: ProvedDesignSettings, margin: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the condition's derivatives by W_i's entries (s, degree + 1, 10, 4, 4) and by nu."""
     scale, symmetric = settings.scaling, symmetric_basis(4)
-    slope = jacobian(system, pool.other, pool.control)[0] * scale[:, None] / scale
+    slope = jacobian(system, pool.nominal, pool.nominal_control)[0] * scale[:, None] / scale
     gain = control_matrix(system, pool.state) * scale[:, None]
     powers = cosine_powers(pool.state[:, ANGLE], settings.cvstem.degree)
     moving = cosine_rates(pool.state[:, ANGLE], pool.state[:, ANGULAR_RATE], settings.cvstem.degree)
@@ -205,11 +180,13 @@ def _rate_blocks(
 
 
 def _held_blocks(
-    system: CartPole, pool: Points, settings: ProvedDesignSettings, margin: float
+    system: CartPole, pool: Samples, settings: ProvedDesignSettings, margin: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the same of the condition over a hold."""
     scale, symmetric = settings.scaling, symmetric_basis(4)
-    following, slope, gain = linearise_hold(system, pool.state, pool.control, settings.period)
+    following, slope, gain = linearise_hold(
+        system, pool.state, pool.nominal_control, settings.period
+    )
     slope, gain = slope * scale[:, None] / scale, gain * scale[:, None]
     before = cosine_powers(pool.state[:, ANGLE], settings.cvstem.degree)
     after = cosine_powers(following[:, ANGLE], settings.cvstem.degree)
@@ -232,7 +209,7 @@ def _largest(
 
 
 def _solve(
-    system: CartPole, pool: Points, held: Points, settings: ProvedDesignSettings
+    system: CartPole, pool: Samples, held: Samples, settings: ProvedDesignSettings
 ) -> tuple[Metric, float]:
     """Solve one program; return the metric, its bounds proved, and nu_h."""
     cvstem, symmetric = settings.cvstem, symmetric_basis(4)
@@ -260,7 +237,16 @@ def _solve(
     cones = len(pool.state) + len(held.state) + 2 * _BOUND_ANGLES
     rows = sparse.csc_matrix(np.vstack(blocks))
     problem = ConeProgram(cost, rows, np.concatenate(rights), cones, 4, symmetric)
-    values = _clarabel(problem, settings)
+    # What the tolerance leaves the proofs make up for, in fewer iterations.
+    values, status = solve_cones(problem, 1e-5)
+    if values is None and status in ("PrimalInfeasible", "AlmostPrimalInfeasible"):
+        raise InfeasibleError(
+            f"no metric of degree {settings.cvstem.degree} with alpha="
+            f"{settings.cvstem.contraction_rate} (margin {settings.cvstem.margin}) exists on "
+            f"{settings.box} and {settings.leaning}: lower the rate or shrink the boxes"
+        )
+    if values is None:
+        raise RuntimeError(f"Clarabel stopped with status {status}: try another control_penalty")
     found = values[:entries].reshape(cvstem.degree + 1, -1)
     scaled = np.einsum("ji,jk,kab->iab", change, found, symmetric)
     return _normalised(system, scaled, values[entries:], settings)
@@ -317,33 +303,3 @@ def _chebyshev(degree: int, reach: float) -> FloatArray:
             )
         rows[order, : len(total[: degree + 1])] = total[: degree + 1]
     return rows
-
-
-def _clarabel(problem: ConeProgram, settings: ProvedDesignSettings) -> FloatArray:
-    """Solve to a tolerance that the proofs make up for, and in fewer iterations."""
-    import clarabel
-
-    options: Any = clarabel.DefaultSettings()
-    options.verbose, options.max_threads = False, 1
-    options.tol_gap_abs = options.tol_gap_rel = 1e-5
-    cones = [clarabel.PSDTriangleConeT(problem.n)] * problem.cones
-    size = problem.cost.size
-    solver = clarabel.DefaultSolver(
-        sparse.csc_matrix((size, size)),
-        problem.cost,
-        problem.rows,
-        problem.right,
-        cones,
-        options,
-    )
-    answer = solver.solve()
-    status = str(answer.status)
-    if status in ("PrimalInfeasible", "AlmostPrimalInfeasible"):
-        raise InfeasibleError(
-            f"no metric of degree {settings.cvstem.degree} with alpha="
-            f"{settings.cvstem.contraction_rate} (margin {settings.cvstem.margin}) exists on "
-            f"{settings.box} and {settings.leaning}: lower the rate or shrink the boxes"
-        )
-    if status not in ("Solved", "AlmostSolved"):
-        raise RuntimeError(f"Clarabel stopped with status {status}: try another control_penalty")
-    return np.array(answer.x)

@@ -57,11 +57,6 @@ def friction_regressor(state: FloatArray, control: FloatArray) -> FloatArray:
     return -state[..., VELOCITY, None]
 
 
-def slope_regressor(state: FloatArray, control: FloatArray) -> FloatArray:
-    """Return Y = 1, shape (..., 1): a is a constant force [N], as of a track that is not level."""
-    return np.ones((*state.shape[:-1], 1))
-
-
 def cart_mass_regressor(model: System) -> Regressor:
     """Return Y = -d2p/dt2 of the model: a is the true mass of the cart less the model's [kg].
 
