@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_policies.contraction.conformal import ConformalBound
+from lagros_policies.contraction.conformal import ConformalBound, conformal_bound
 
 FloatArray = NDArray[np.float64]
 
