@@ -25,6 +25,10 @@ FloatArray = NDArray[np.float64]
 
 # Labels that spread less than this share of the largest spread, squared, are the same all over.
 _STILL = 1e-12
+# An input that spreads by no more is the same all over, but for what a solver leaves of its goal;
+# scaled up, single precision would lose it.
+_STEADY = 1e-6
+_ONE = np.float32(1.0)
 
 
 @dataclass(frozen=True)
@@ -149,7 +153,7 @@ class _Run(Fit[TrainingSettings]):
         import torch
 
         self.alike = alike
-        self.input_mean, self.input_scale = _statistics(features[:first], alike)
+        self.input_mean, self.input_scale = _statistics(features[:first], _STEADY, alike)
         self.output_mean, self.output_units = _units(labels[:first])
         self.features = torch.from_numpy((features - self.input_mean) / self.input_scale)
         self.labels = torch.from_numpy(_in_units(labels - self.output_mean, self.output_units))
@@ -193,23 +197,23 @@ class _Run(Fit[TrainingSettings]):
 
 
 def _statistics(
-    values: Float32Array, alike: Alike | None = None
+    values: Float32Array, least: float, alike: Alike | None = None
 ) -> tuple[Float32Array, Float32Array]:
+    """Return mean and spread of each column; one where it spreads by no more than `least`."""
     deviation = values.std(axis=0, dtype=np.float64).astype(np.float32)
     mean = values.mean(axis=0, dtype=np.float64).astype(np.float32)
     if alike is not None:
         # One scale for all discs; the zeros of those that are not there say nothing of it.
         rows = values[:, -alike.things * alike.size :].reshape(-1, alike.size)
-        for part, scale in zip(
-            (mean, deviation), _statistics(rows[rows[:, -1] > 0.0]), strict=True
-        ):
+        there = _statistics(rows[rows[:, -1] > 0.0], least)
+        for part, scale in zip((mean, deviation), there, strict=True):
             part[-alike.things * alike.size :] = np.tile(scale, alike.things)
-    return mean, np.where(deviation > 0.0, deviation, np.float32(1.0))
+    return mean, np.where(deviation > least * np.maximum(np.abs(mean), 1.0), deviation, _ONE)
 
 
 def _units(labels: Float32Array) -> tuple[Float32Array, Float32Array]:
     """Return the mean of labels, (m,), and the rows of which they are uncorrelated sums, (m, m)."""
-    mean, deviation = _statistics(labels)
+    mean, deviation = _statistics(labels, 0.0)
     if len(mean) == 1:
         return mean, deviation[:, None]
     values, vectors = np.linalg.eigh(np.cov(labels, rowvar=False, dtype=np.float64))

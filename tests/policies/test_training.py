@@ -203,3 +203,16 @@ def test_a_small_difference_of_large_outputs_is_learned_as_well_as_their_sum(tmp
     sums, differences = found.sum(axis=1), found[:, 0] - found[:, 1]
     assert np.mean(np.abs(sums - 2.0 * total)) < 0.1 * 2.0 * np.std(total)
     assert np.mean(np.abs(differences - 2.0 * apart)) < 0.1 * 2.0 * np.std(apart)
+
+
+def test_an_input_that_hardly_varies_is_not_scaled_up(tmp_path):
+    rng = np.random.default_rng(1)
+    inputs = rng.normal(size=(1000, 2)).astype(np.float32)
+    # A goal as a solver leaves it: single precision holds it to 1e-7.
+    inputs[:, 1] = 1.5 + 1e-7 * rng.normal(size=1000)
+    labels = np.tanh(inputs[:, :1])
+    settings = TrainingSettings(hidden=(8,), epochs=30, batch=64, learning_rate=1e-2)
+    network = fit(inputs, labels, settings, tmp_path / "checkpoint")
+    exact = np.column_stack([inputs[:, 0], np.full(1000, 1.5)]).astype(np.float32)
+    assert np.mean(np.abs(network(exact) - labels)) < 0.05
+    assert np.abs(network.weights[0]).max() < 100.0

@@ -72,7 +72,7 @@ class PvtolSettings(Task):
         rounds=3,
         round_plans=2500,
         round_samples=60_000,
-        round_epochs=24,
+        round_epochs=18,
     )
     defaults = Defaults(bounds=(0.3,), bound=0.3)
 
