@@ -11,7 +11,6 @@ decision and what comes of it calls `begin`, `decide` and `move` in the place of
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -42,6 +41,7 @@ class ClosedLoop:
         terminated: Whether the last step ended the episode, each of a batch.
         truncated: Whether it reached the time limit, likewise.
         ended: Whether any step has done so, likewise.
+        over: Whether all that flies has ended, or is at the time limit where it flies on.
         info: The environment's, at this instant.
         step_times: Time of every decision [s].
     """
@@ -54,14 +54,16 @@ class ClosedLoop:
     terminated: Any
     truncated: Any
     ended: Any
+    over: bool
     info: dict[str, Any]
     step_times: list[float]
 
     def __init__(self, env: Any, policy: Any, past_the_end: bool = False) -> None:
         """Nothing flies yet."""
         self.env, self.policy = env, as_policy(policy)
-        self._past_the_end = past_the_end
+        self._past_the_end, self._batch = past_the_end, False
         self._seed: Any = None
+        self._shapes: Sequence[tuple[int, ...]] = ()
         self._clear()
 
     def fly(self, seed: Any, options: dict[str, Any] | None = None) -> Iterator[ClosedLoop]:
@@ -83,35 +85,42 @@ class ClosedLoop:
         self._clear()
         self._seed = seed
         self.observation, self.info = self.env.reset(seed=seed, options=options)
-        if np.ndim(self.observation) > 1:
+        # Asked for once: what follows is done at every step.
+        self._shapes, self._batch = self.shapes(), np.ndim(self.observation) > 1
+        if self._batch:
             self.ended = np.zeros(len(self.observation), bool)
 
     def decide(self) -> None:
         """Ask the policy for its action; what it draws comes from the stream of the first seed."""
         if self.step == 0:
             reseed(self.policy, self._seed if np.ndim(self._seed) == 0 else self._seed[0])
-        seen = self.seen()
-        starts = _starts(seen, self.step == 0)
-        self.action, self.memory, seconds = ask(
-            self.policy, seen, self.memory, starts, *self.shapes()
-        )
+        seen, first = self.seen(), self.step == 0
+        starts = [first] if seen.ndim == 1 else np.full(len(seen), first)
+        answer = ask(self.policy, seen, self.memory, starts, *self._shapes)
+        self.action, self.memory, seconds = answer
         self.step_times.append(seconds)
 
     def move(self) -> None:
         """Hold the action for one control step."""
-        if not self._past_the_end and np.ndim(self.ended):
-            self.action[self.ended] = 0.0
-        with beyond_the_end() if self._past_the_end else nullcontext():
-            self.observation, self.reward, self.terminated, self.truncated, self.info = (
-                self.env.step(self.action)
-            )
-        self.ended = self.ended | self.terminated | self.truncated
+        if self._batch:
+            self._move_batch()
+            return
+        outcome = self.env.step(self.action)
+        self.observation, self.reward, self.terminated, self.truncated, self.info = outcome
+        self.ended = self.over = self.terminated or self.truncated
         self.step += 1
 
-    @property
-    def over(self) -> bool:
-        """Whether all that flies has ended, or is at the time limit where it flies on."""
-        return bool(np.all(self.truncated if self._past_the_end else self.ended))
+    def _move_batch(self) -> None:
+        if self._past_the_end:
+            with beyond_the_end():
+                outcome = self.env.step(self.action)
+        else:
+            self.action[self.ended] = 0.0
+            outcome = self.env.step(self.action)
+        self.observation, self.reward, self.terminated, self.truncated, self.info = outcome
+        self.ended = self.ended | self.terminated | self.truncated
+        self.over = bool(np.all(self.truncated if self._past_the_end else self.ended))
+        self.step += 1
 
     def counters(self) -> dict[str, int]:
         """Return what the policy has counted."""
@@ -130,7 +139,8 @@ class ClosedLoop:
         """
         self.begin(seed, options)
         seen = self.seen()
-        rehearse(what, self.policy, seen, _starts(seen, True), *self.shapes())
+        starts = np.ones(len(seen) if seen.ndim > 1 else 1, bool)
+        rehearse(what, self.policy, seen, starts, *self._shapes)
 
     def seen(self) -> Any:
         """Return what the policy is fed now."""
@@ -143,9 +153,5 @@ class ClosedLoop:
     def _clear(self) -> None:
         self.step, self.reward = 0, 0.0
         self.observation = self.action = self.memory = None
-        self.terminated = self.truncated = self.ended = False
+        self.terminated = self.truncated = self.ended = self.over = False
         self.info, self.step_times = {}, []
-
-
-def _starts(seen: Any, first: bool) -> Any:
-    return [first] if np.ndim(seen) == 1 else np.full(len(seen), first)
