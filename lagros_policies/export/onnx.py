@@ -35,6 +35,9 @@ _OPERATORS = {
     "abs": "Abs",
 }
 
+# A row of numbers in the graph, and what each is called.
+Named = tuple[str, Sequence[str]]
+
 
 def onnx_file(source: Source) -> bytes:
     """Return the ONNX model of a policy.
@@ -51,31 +54,27 @@ def onnx_file(source: Source) -> bytes:
         ImportError: onnx is not installed.
     """
     graph, program = _Graph(), source.program
-    own, sizes = len(program.places), []
-    for kind in program.bodies:
-        sizes += [kind.slots * kind.each.size, kind.slots]
-    given = graph.split("observation", [own, *sizes]) if sizes else ["observation"]
+    own, size = len(program.places), program.control.size
+    sizes = [n for kind in program.bodies for n in (kind.slots * kind.each.size, kind.slots)]
     # With bodies there are three axes: batch, slots (one, of what belongs to nobody), numbers.
-    deep = bool(sizes)
-    first = graph.do("Reshape", given[0], np.array([0, 1, own])) if deep else given[0]
-    names = dict(zip(program.places, graph.split(first, [1] * own), strict=True))
-    seen = graph.lines(program.looking, names, program.places)
-    count = len(seen) - len(program.contexts)
-    context = dict(zip(program.contexts, seen[count:], strict=True))
-    inputs = seen[:count]
+    first, *given = graph.split("observation", [own, *sizes])
+    if sizes:
+        first = graph.do("Reshape", first, np.array([0, 1, own]))
+    looking, contexts = program.looking, program.contexts
+    seen = _Rows(graph, looking, [(first, program.places)])
+    count = len(looking.outputs) - len(contexts)
+    inputs = [seen.row(looking.outputs[:count])]
+    context = [(seen.row(looking.outputs[count:]), contexts)] if contexts else []
     for place, kind in enumerate(program.bodies):
-        line = program.seeing(kind)
-        inputs.append(graph.pooled(kind, line, given[1 + 2 * place : 3 + 2 * place], context))
+        parts = given[2 * place : 2 * place + 2]
+        inputs.append(graph.pooled(kind, program.seeing(kind), parts, context))
     between = "Tanh" if program.tanh else "Relu"
     answer = graph.layers(graph.joined(inputs), program.layers, between)
-    outputs = len(program.layers[-1][1])
-    pieces = graph.split(answer, [1] * outputs)
     acting = program.acting
-    named = {**dict(zip(acting.inputs, pieces, strict=False)), **context}
-    control = graph.joined(graph.lines(acting, named, acting.inputs))
+    outputs = acting.inputs[: len(acting.inputs) - len(contexts)]
+    control = _Rows(graph, acting, [(answer, outputs), *context]).row(acting.outputs)
     if program.last is not None:
         control = graph.do("Relu", graph.do("MatMul", control, program.last))
-    size = program.control.size
     graph.do("Reshape", control, np.array([0, size]), name=program.control.name)
     metadata = {
         "policy": source.name,
@@ -152,47 +151,8 @@ class _Graph:
             value = self.do(activation, value) if activation else value
         return value
 
-    def lines(
-        self, line: StraightLine, names: dict[str, str], places: Sequence[str], zeros: str = ""
-    ) -> list[str]:
-        """Add recorded operations.
-
-        Args:
-            line: The operations.
-            names: Of inputs to those of values.
-            places: Inputs that have the shape of the outputs.
-            zeros: Of that shape; made of the first input if left out.
-        """
-        known = dict(names)
-
-        def value(operand: str) -> str:
-            if operand not in known:
-                known[operand] = self.constant(float(operand))
-            return known[operand]
-
-        # The comparison of a minimum is added only where something else asks for it.
-        asked = {one for out in line.operations.values() if not is_bound(line, out)
-                 for one in out.operands}  # fmt: skip
-        for name, operation in line.operations.items():
-            if is_bound(line, operation):
-                tested = line.operations[operation.operands[0]]
-                bound = "Min" if tested.symbol == ">" else "Max"
-                known[name] = self.do(bound, *map(value, tested.operands))
-            elif operation.symbol not in ("<=", ">") or name in asked:
-                operands = map(value, operation.operands)
-                known[name] = self.do(_OPERATORS[operation.symbol], *operands)
-        shaped = _depending(line, places)
-        results = []
-        for output in line.outputs:
-            result = value(output)
-            if output not in shaped:
-                zeros = zeros or self.do("Mul", value(places[0]), 0.0)
-                result = self.do("Add", result, zeros)
-            results.append(result)
-        return results
-
     def pooled(
-        self, kind: Bodies, line: StraightLine, given: Sequence[str], context: dict[str, str]
+        self, kind: Bodies, line: StraightLine, given: Sequence[str], context: Sequence[Named]
     ) -> str:
         """Add up what is seen of the bodies of one kind.
 
@@ -200,16 +160,17 @@ class _Graph:
             kind: The kind.
             line: What is seen of one.
             given: Their numbers, and the mask.
-            context: Values that do not differ among them.
+            context: What does not differ among them.
         """
         size = kind.each.size
         slots = self.do("Reshape", given[0], np.array([0, kind.slots, size]))
         mask = self.do("Reshape", given[1], np.array([0, kind.slots, 1]))
-        places = dict(zip(kind.each.places, self.split(slots, [1] * size), strict=True))
         zeros = self.do("Mul", mask, 0.0)
-        names = {**places, **context}
-        *features, weight = self.lines(line, names, kind.each.places, zeros)
-        seen = self.layers(self.joined(features), kind.layers, "Relu", "Relu")
+        # What does not differ among the slots takes their shape.
+        shaped = [(self.do("Add", value, zeros), names) for value, names in context]
+        rows = _Rows(self, line, [(slots, kind.each.places), *shaped])
+        features, weight = rows.row(line.outputs[:-1]), rows.row(line.outputs[-1:])
+        seen = self.layers(features, kind.layers, "Relu", "Relu")
         # Zero times the mask: a NaN there must not hide a body.
         sensed = self.do("Where", self.do("Greater", mask, 0.0), weight, zeros)
         return self.do("ReduceSum", self.do("Mul", seen, sensed), np.array([1]), keepdims=1)
@@ -235,10 +196,58 @@ class _Graph:
         return bytes(made.SerializeToString())
 
 
-def _depending(line: StraightLine, places: Sequence[str]) -> set[str]:
-    """Return the names of what depends on some inputs."""
-    found = set(places)
-    for name, operation in line.operations.items():
-        if not found.isdisjoint(operation.operands):
-            found.add(name)
-    return found
+class _Rows:
+    """Recorded operations in a graph: those of one kind and depth are one node on a row of numbers.
+
+    Args:
+        graph: The graph, to which they are added.
+        line: The operations.
+        given: Rows of the inputs, and their names.
+    """
+
+    def __init__(self, graph: _Graph, line: StraightLine, given: Sequence[Named]) -> None:
+        self._graph, self._first = graph, given[0][0]
+        self._width = {value: len(names) for value, names in given}
+        self._at = {name: (value, k) for value, names in given for k, name in enumerate(names)}
+        self._joined: dict[tuple[str, ...], str] = {}
+        depth = dict.fromkeys(self._at, 0)
+        alike: dict[tuple[int, str], list[tuple[str, Sequence[str]]]] = {}
+        for name, operation in line.operations.items():
+            operator, operands = _OPERATORS[operation.symbol], operation.operands
+            if is_bound(line, operation):
+                tested = line.operations[operands[0]]
+                operator, operands = "Min" if tested.symbol == ">" else "Max", tested.operands
+            depth[name] = 1 + max(depth.get(one, 0) for one in operands)
+            alike.setdefault((depth[name], operator), []).append((name, operands))
+        for (_, operator), found in sorted(alike.items()):
+            columns = zip(*(operands for _, operands in found), strict=True)
+            value = graph.do(operator, *(self.row(column, whole=False) for column in columns))
+            self._width[value] = len(found)
+            self._at |= {name: (value, k) for k, (name, _) in enumerate(found)}
+
+    def row(self, names: Sequence[str], whole: bool = True) -> str:
+        """Return the numbers with these names beside each other.
+
+        Args:
+            names: Of the numbers.
+            whole: Whether all are needed, even if they are one or do not depend on the input.
+        """
+        constants = [name for name in names if name not in self._at]
+        if len(constants) == len(names) and not whole:
+            return self._graph.constant(np.array([float(name) for name in names]))
+        for name in constants:
+            zero = self._graph.do("Mul", self.row([next(iter(self._at))]), 0.0)
+            self._at[name] = self._graph.do("Add", zero, float(name)), 0
+            self._width[self._at[name][0]] = 1
+        if not whole and len(set(names)) == 1:
+            names = names[:1]
+        places = [self._at[name] for name in names]
+        values = tuple(dict.fromkeys(value for value, _ in places))
+        if values not in self._joined:
+            self._joined[values] = self._graph.joined(values)
+        widths = [self._width[value] for value in values]
+        begins = dict(zip(values, np.cumsum([0, *widths]).tolist(), strict=False))
+        wanted = [begins[value] + place for value, place in places]
+        if wanted == list(range(sum(widths))):
+            return self._joined[values]
+        return self._graph.do("Gather", self._joined[values], np.array(wanted), axis=-1)

@@ -143,6 +143,22 @@ def test_every_operation_means_the_same_in_every_language(parts, answer):
     np.testing.assert_allclose(answer(source, rows), source.answer(rows), rtol=2e-5, atol=2e-5)
 
 
+def test_features_may_be_constant_or_the_same(answer):
+    source = of_features((Part("x", 3, "all"),))
+    program = Program(
+        source.program.parts,
+        lambda given: ([given[1]] * 11 + [2.0], []),
+        source.program.layers,
+        lambda outputs, _: [outputs[11]] * 6 + [outputs[0]] * 5 + [0.5],
+        source.program.control,
+    )
+    rows = source.examples(3)
+    found = answer(Source("own", "", "0", None, source.exported._replace(program=program)), rows)
+    y = rows[:, 1:2]
+    two, half = np.full((3, 6), 2.0), np.full((3, 1), 0.5)
+    np.testing.assert_array_equal(found, np.hstack([two, *[y] * 5, half]))
+
+
 @pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("name", ["pvtol", "own"])
 def test_the_file_compiles_without_a_warning_and_tests_itself(name, tmp_path):
