@@ -119,6 +119,14 @@ class Recorded:
         """Record whether it is more than another."""
         return self.tape.record(">", self, other)
 
+    def __lt__(self, other: Any) -> Recorded:
+        """Record whether it is less than another."""
+        return self.tape.record(">", other, self)
+
+    def __ge__(self, other: Any) -> Recorded:
+        """Record whether it is at least another."""
+        return self.tape.record("<=", other, self)
+
     def __and__(self, other: Any) -> Recorded:
         """Record whether both of two comparisons hold."""
         return self.tape.record("&", self, other)

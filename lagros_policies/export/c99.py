@@ -217,7 +217,8 @@ def _see(program: Program, kind: Bodies) -> Iterator[str]:
     line = program.seeing(kind)
     features = [f"feature[{index}]" for index in range(len(line.outputs) - 1)]
     yield _function(
-        f"static void see_{kind.name}(const float *{kind.name}, const float *context, float *sum)",
+        f"static void see_{kind.name}("
+        f"const float *{kind.name}, const float *context, float *restrict sum)",
         [
             f"float feature[{len(features)}], seen[{kind.width}], weight;",
             "int i;",

@@ -40,7 +40,7 @@ def layer(name: str, weight: Float32Array, bias: Float32Array, activation: Activ
         activation: What follows. "rational" calls `rational_tanh`, of `rational_tanh_source`, and
             "libm" `tanhf`; "relu" gives NaN for NaN.
     """
-    if weight.shape[1] < VECTOR:
+    if weight.shape[1] < VECTOR and weight.shape[0] > weight.shape[1]:
         return _narrow(name, weight, bias, activation)
     return _wide(name, weight, bias, activation)
 
@@ -49,9 +49,8 @@ def _wide(name: str, weight: Float32Array, bias: Float32Array, activation: Activ
     inputs, outputs = weight.shape
     split = outputs - outputs % VECTOR
     # Of each part: what its names end with, its width and its first output.
-    parts = [("", split, 0)]
-    if split < outputs:
-        parts.append(("_rest", outputs - split, split))
+    parts = [("", split, 0), ("_rest", outputs - split, split)]
+    parts = [part for part in parts if part[1]]
     paired = inputs - inputs % 2
     arrays = [_array_of_part(name, weight, part) for part in parts]
     sums = ", ".join(f"even{end}[{width}], odd{end}[{width}]" for end, width, _ in parts)

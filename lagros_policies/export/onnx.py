@@ -35,6 +35,7 @@ _OPERATORS = {
     "abs": "Abs",
 }
 
+_MANY, _LONG = 5, 10  # operations that one node on a row outweighs; numbers that one Gather does
 # A row of numbers in the graph, and what each is called.
 Named = tuple[str, Sequence[str]]
 
@@ -58,13 +59,17 @@ def onnx_file(source: Source) -> bytes:
     sizes = [n for kind in program.bodies for n in (kind.slots * kind.each.size, kind.slots)]
     # With bodies there are three axes: batch, slots (one, of what belongs to nobody), numbers.
     first, *given = graph.split("observation", [own, *sizes])
-    if sizes:
+    deep = bool(sizes)
+    if deep:
         first = graph.do("Reshape", first, np.array([0, 1, own]))
     looking, contexts = program.looking, program.contexts
-    seen = _Rows(graph, looking, [(first, program.places)])
+    seen = _Rows(graph, looking, [(first, program.places)], deep)
     count = len(looking.outputs) - len(contexts)
     inputs = [seen.row(looking.outputs[:count])]
-    context = [(seen.row(looking.outputs[count:]), contexts)] if contexts else []
+    context = [
+        (seen.row([output]), [name])
+        for name, output in zip(contexts, looking.outputs[count:], strict=True)
+    ]
     for place, kind in enumerate(program.bodies):
         parts = given[2 * place : 2 * place + 2]
         inputs.append(graph.pooled(kind, program.seeing(kind), parts, context))
@@ -72,10 +77,12 @@ def onnx_file(source: Source) -> bytes:
     answer = graph.layers(graph.joined(inputs), program.layers, between)
     acting = program.acting
     outputs = acting.inputs[: len(acting.inputs) - len(contexts)]
-    control = _Rows(graph, acting, [(answer, outputs), *context]).row(acting.outputs)
+    control = _Rows(graph, acting, [(answer, outputs), *context], deep).row(acting.outputs)
     if program.last is not None:
         control = graph.do("Relu", graph.do("MatMul", control, program.last))
-    graph.do("Reshape", control, np.array([0, size]), name=program.control.name)
+    if deep:
+        control = graph.do("Reshape", control, np.array([0, size]))
+    graph.call(control, program.control.name)
     metadata = {
         "policy": source.name,
         "weights": source.file,
@@ -94,7 +101,7 @@ def network_model(network: Mlp) -> bytes:
     """
     graph = _Graph()
     answer = graph.layers("x", list(zip(network.weights, network.biases, strict=True)), "Tanh")
-    graph.do("Identity", answer, name="y")
+    graph.call(answer, "y")
     return graph.model(("x", 1, network.inputs), ("y", 1, network.outputs), {})
 
 
@@ -120,15 +127,20 @@ class _Graph:
             self._constants[key] = self._onnx.numpy_helper.from_array(stored, name)
         return self._constants[key].name
 
-    def do(
-        self, operation: str, *inputs: str | NDArray[Any] | float, name: str = "", **attributes: Any
-    ) -> str:
+    def do(self, operation: str, *inputs: str | NDArray[Any] | float, **attributes: Any) -> str:
         """Add a node with one output."""
         names = [one if isinstance(one, str) else self.constant(one) for one in inputs]
-        result = name or f"v{len(self._nodes)}"
+        result = f"v{len(self._nodes)}"
         made = self._onnx.helper.make_node(operation, names, [result], **attributes)
         self._nodes.append(made)
         return result
+
+    def call(self, value: str, name: str) -> None:
+        """Give the result of the last node the name of the model's output."""
+        if [value] == list(self._nodes[-1].output):
+            self._nodes[-1].output[0] = name
+        else:
+            self._nodes.append(self._onnx.helper.make_node("Identity", [value], [name]))
 
     def split(self, value: str, sizes: Sequence[int]) -> list[str]:
         """Cut the last axis into pieces."""
@@ -166,9 +178,7 @@ class _Graph:
         slots = self.do("Reshape", given[0], np.array([0, kind.slots, size]))
         mask = self.do("Reshape", given[1], np.array([0, kind.slots, 1]))
         zeros = self.do("Mul", mask, 0.0)
-        # What does not differ among the slots takes their shape.
-        shaped = [(self.do("Add", value, zeros), names) for value, names in context]
-        rows = _Rows(self, line, [(slots, kind.each.places), *shaped])
+        rows = _Rows(self, line, [(slots, kind.each.places), *context], True, zeros)
         features, weight = rows.row(line.outputs[:-1]), rows.row(line.outputs[-1:])
         seen = self.layers(features, kind.layers, "Relu", "Relu")
         # Zero times the mask: a NaN there must not hide a body.
@@ -197,33 +207,55 @@ class _Graph:
 
 
 class _Rows:
-    """Recorded operations in a graph: those of one kind and depth are one node on a row of numbers.
+    """Recorded operations in a graph: many of one kind and depth are one node on a row of numbers.
 
     Args:
         graph: The graph, to which they are added.
         line: The operations.
         given: Rows of the inputs, and their names.
+        one_by_one: Whether every operation is a node: where a row has more axes than batch and
+            numbers, to cut it and to put it together costs more than the nodes.
+        zeros: In the shape of the first row, for results that do not depend on it.
     """
 
-    def __init__(self, graph: _Graph, line: StraightLine, given: Sequence[Named]) -> None:
-        self._graph, self._first = graph, given[0][0]
-        self._width = {value: len(names) for value, names in given}
-        self._at = {name: (value, k) for value, names in given for k, name in enumerate(names)}
+    def __init__(
+        self,
+        graph: _Graph,
+        line: StraightLine,
+        given: Sequence[Named],
+        one_by_one: bool = False,
+        zeros: str = "",
+    ) -> None:
+        self._graph, self._one_by_one, self._zeros = graph, one_by_one, zeros
+        self._differing = {*given[0][1]}
         self._joined: dict[tuple[str, ...], str] = {}
+        self._rows = dict(given)
+        self._at = {name: value for value, names in given for name in names}
+        self._pieces: dict[str, str] = {}
         depth = dict.fromkeys(self._at, 0)
         alike: dict[tuple[int, str], list[tuple[str, Sequence[str]]]] = {}
+        asked = {*line.outputs}
+        for name, operation in reversed(line.operations.items()):
+            if name in asked:
+                bound = is_bound(line, operation)
+                asked.update(operation.operands[1:] if bound else operation.operands)
         for name, operation in line.operations.items():
             operator, operands = _OPERATORS[operation.symbol], operation.operands
             if is_bound(line, operation):
                 tested = line.operations[operands[0]]
                 operator, operands = "Min" if tested.symbol == ">" else "Max", tested.operands
+            if not self._differing.isdisjoint(operands):
+                self._differing.add(name)
             depth[name] = 1 + max(depth.get(one, 0) for one in operands)
-            alike.setdefault((depth[name], operator), []).append((name, operands))
+            if name in asked:
+                alike.setdefault((depth[name], operator), []).append((name, operands))
         for (_, operator), found in sorted(alike.items()):
-            columns = zip(*(operands for _, operands in found), strict=True)
-            value = graph.do(operator, *(self.row(column, whole=False) for column in columns))
-            self._width[value] = len(found)
-            self._at |= {name: (value, k) for k, (name, _) in enumerate(found)}
+            single = self._one_by_one or len(found) < _MANY
+            for some in [[one] for one in found] if single else [found]:
+                columns = zip(*(operands for _, operands in some), strict=True)
+                value = graph.do(operator, *(self.row(one, whole=False) for one in columns))
+                self._rows[value] = [name for name, _ in some]
+                self._at |= {name: value for name, _ in some}
 
     def row(self, names: Sequence[str], whole: bool = True) -> str:
         """Return the numbers with these names beside each other.
@@ -232,22 +264,46 @@ class _Rows:
             names: Of the numbers.
             whole: Whether all are needed, even if they are one or do not depend on the input.
         """
-        constants = [name for name in names if name not in self._at]
-        if len(constants) == len(names) and not whole:
+        if not whole and self._at.keys().isdisjoint(names):
             return self._graph.constant(np.array([float(name) for name in names]))
-        for name in constants:
-            zero = self._graph.do("Mul", self.row([next(iter(self._at))]), 0.0)
-            self._at[name] = self._graph.do("Add", zero, float(name)), 0
-            self._width[self._at[name][0]] = 1
         if not whole and len(set(names)) == 1:
-            names = names[:1]
-        places = [self._at[name] for name in names]
-        values = tuple(dict.fromkeys(value for value, _ in places))
+            return self._piece(names[0])
+        if self._one_by_one or len(names) < _LONG or not self._at.keys() >= {*names}:
+            return self._graph.joined(self._parts(names, whole))
+        values = tuple(dict.fromkeys(self._at[name] for name in names))
         if values not in self._joined:
             self._joined[values] = self._graph.joined(values)
-        widths = [self._width[value] for value in values]
-        begins = dict(zip(values, np.cumsum([0, *widths]).tolist(), strict=False))
-        wanted = [begins[value] + place for value, place in places]
-        if wanted == list(range(sum(widths))):
+        order = [name for value in values for name in self._rows[value]]
+        if order == list(names):
             return self._joined[values]
-        return self._graph.do("Gather", self._joined[values], np.array(wanted), axis=-1)
+        place = {name: index for index, name in enumerate(order)}
+        wanted = np.array([place[name] for name in names])
+        return self._graph.do("Gather", self._joined[values], wanted, axis=-1)
+
+    def _parts(self, names: Sequence[str], whole: bool) -> list[str]:
+        """Return rows and single numbers that, side by side, have these names."""
+        parts, left = [], list(names)
+        while left:
+            together = list(self._rows.get(self._at.get(left[0], ""), ()))
+            if len(together) > 1 and left[: len(together)] == together:
+                parts.append(self._at[left[0]])
+                del left[: len(together)]
+                continue
+            name = left.pop(0)
+            part = self._piece(name)
+            if whole and self._zeros and name not in self._differing:
+                part = self._graph.do("Add", part, self._zeros)
+            parts.append(part)
+        return parts
+
+    def _piece(self, name: str) -> str:
+        """Return a number on its own."""
+        if name not in self._pieces:
+            if name in self._at:
+                row = self._rows[self._at[name]]
+                cut = self._graph.split(self._at[name], [1] * len(row))
+                self._pieces |= dict(zip(row, cut, strict=True))
+            else:
+                zero = self._graph.do("Mul", self._piece(next(iter(self._at))), 0.0)
+                self._pieces[name] = self._graph.do("Add", zero, float(name))
+        return self._pieces[name]

@@ -42,7 +42,7 @@ class CartPoleView:
     def __call__(self, observation: Sequence[Any], functions: Any) -> Seen:
         """See an observation, given by its components."""
         lean = observation[_START + ANGLE]
-        side = functions.where(-lean > 0.0, -1.0, 1.0)
+        side = functions.where(lean < 0.0, -1.0, 1.0)
         goal = observation[_GOAL + POSITION]
         sided = [
             observation[_STATE + POSITION] - goal,
