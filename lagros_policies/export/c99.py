@@ -110,8 +110,8 @@ def c_file(source: Source, tanh: Tanh = "rational") -> str:
         [
             _header(source, tanh),
             *([rational_tanh_source()] if rational else []),
-            *_network("network", program.layers, hidden, "none"),
             *(part for kind in program.bodies for part in _see(program, kind)),
+            *_network("network", program.layers, hidden, "none"),
             *_answer(program),
             *_interface(source),
             _self_test(source),
