@@ -15,8 +15,8 @@ Every kind knows `+ - * /` with its own kind and with floats, the sign, integer 
 and the functions of `lagros_envs.numbers.functions`: `sin`, `cos`, `tan`, `exp`, `sqrt`. Nothing
 else may be used in a `derivative`: no comparison and no branch on the state, no `min`, no `math` or
 `numpy` of its own. (The rules of a task, such as who has fallen, are for floats, arrays and
-`Recorded`, and may also compare by `<=` and `>`, join comparisons by `&` and `|`, and choose by
-`where`.)
+`Recorded`, and may also compare, join comparisons by `&` and `|`, and choose by `where`, `minimum`
+and `maximum`.)
 """
 
 from lagros_envs.numbers import functions

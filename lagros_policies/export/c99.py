@@ -334,7 +334,7 @@ def _expression(operation: Operation, operands: Sequence[str]) -> str:
         return f"fabsf({texts[0]})"
     if len(texts) == 1:
         return f"{operation.symbol}f({texts[0]})"
-    symbol = "&&" if operation.symbol == "&" else operation.symbol
+    symbol = operation.symbol * 2 if operation.symbol in "&|" else operation.symbol
     return f"({texts[0]} {symbol} {texts[1]})"
 
 

@@ -26,6 +26,7 @@ _OPERATORS = {
     "<=": "LessOrEqual",
     ">": "Greater",
     "&": "And",
+    "|": "Or",
     "where": "Where",
     "sin": "Sin",
     "cos": "Cos",

@@ -215,7 +215,7 @@ def _noticed(line: StraightLine, place: str) -> bool:
         if operation.symbol == "where":
             kept = hit[2] if is_bound(line, operation) else hit[1] and hit[2]
         else:
-            kept = any(hit) and operation.symbol not in ("<=", ">", "&")
+            kept = any(hit) and operation.symbol not in ("<=", ">", "&", "|")
         if kept:
             spoiled.add(name)
     return any(output in spoiled for output in line.outputs)

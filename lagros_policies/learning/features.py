@@ -2,8 +2,8 @@
 
 The features of a task are one function over the kinds of number of `lagros_envs.numbers`: called
 with floats or arrays it gives features, called with recorded numbers the list of its operations, of
-which `lagros export` makes C and ONNX. It may use `+ - * /`, integer powers, `abs`, comparisons, `&` and
-the functions that are passed to it, and nothing else.
+which `lagros export` makes C and ONNX. It may use `+ - * /`, integer powers, `abs`, comparisons,
+`&`, `|` and the functions that are passed to it, and nothing else.
 """
 
 from __future__ import annotations

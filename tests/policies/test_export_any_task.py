@@ -92,14 +92,14 @@ def look(given):
     """Every operation that features may use."""
     a, b, c = given
     turned = Vector(a, b) * Vector(c, 0.5).conj() / 2.0
-    inside = (a > -1.0) & (b <= 0.5)
+    inside = (a > -1.0) & (b < 0.5)
     features = [
         functions.sin(a) + functions.cos(b) * functions.tan(0.3 * c),
         functions.exp(-abs(a)) / functions.sqrt(2.0 + b * b),
         a**3 - c**-2,
         functions.minimum(a, b),
         functions.maximum(b - c, 0.25),
-        functions.where(inside, a, b) + functions.where(inside, 1.0, c),
+        functions.where(inside | (c >= 2.0), a, b) + functions.where(inside, 1.0, c),
         turned.real,
         (-turned + 1.0).imag,
         abs(turned),
