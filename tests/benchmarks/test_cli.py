@@ -13,6 +13,8 @@ import lagros_policies
 from lagros_benchmarks.commands import cli
 from lagros_benchmarks.run import library
 from lagros_envs.disturbances import KINDS
+from lagros_envs.registry import task_named, task_names
+from lagros_policies.policy import policy_names
 from tests.benchmarks import fakes
 
 HEAVY = ("torch", "scipy", "matplotlib", "joblib", "cvxpy", "piqp", "gymnasium", "rich.progress")
@@ -173,3 +175,12 @@ def test_the_folder_is_searched_last_and_for_classes_alone(invoke, tmp_path, mon
     assert result.exit_code == 1
     assert "ArithmeticError: of the folder" in result.stderr
     assert sys.path == [*before, str(tmp_path)]
+
+
+def test_the_help_says_what_the_registry_knows_of_every_task(invoke):
+    told = " ".join(invoke("bench", "--help").stdout.replace("│", " ").split())
+    for name in task_names():
+        bounds = ", ".join(f"{bound:g}" for bound in task_named(name).defaults.bounds)
+        assert f"{name}: {bounds}" in told
+        assert f"{name}: {', '.join(policy_names(task_named(name)))}" in told
+    assert ", ".join(task_names()) in told

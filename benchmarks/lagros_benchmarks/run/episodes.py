@@ -18,7 +18,6 @@ from lagros_benchmarks.run.library import Environment, FloatArray
 # planner promises its plans to the same accuracy.
 TUBE_TOLERANCE = 1e-6
 
-ACTION = (1,)
 # What a policy counts by the clock, which is another number every time.
 TIMED_COUNTERS = ("late_plans",)
 

@@ -69,15 +69,6 @@ def unknown_name(what: str, given: object, valid: Iterable[str], note: str = "")
     return f"unknown {what} {shown(given)}.{hint} Valid: {', '.join(names)}{note}."
 
 
-def check_task(task: str) -> None:
-    """Check that there is a task.
-
-    Raises:
-        ValueError: There is none.
-    """
-    find_task(task)
-
-
 def check_policy(name: str, task: str | None = None) -> None:
     """Check that a policy is a known name, an existing file or an importable module.
 

@@ -124,7 +124,7 @@ class WorldsLoop(ClosedLoop):
 
     def seen(self) -> Any:
         """Return the rows of all agents, or `state()` of all worlds where it observes "global"."""
-        return self.env.state() if is_global(self.policy) else self.observation
+        return self.env.state() if self.policy.observes == "global" else self.observation
 
     def shapes(self) -> list[tuple[int, ...]]:
         """Return the shapes that the actions may have."""
@@ -192,14 +192,9 @@ class Trace:
 def shapes_of(policy: BasePolicy, worlds: int, agents: int) -> list[tuple[int, ...]]:
     """Return the shapes that the actions of a policy may have; the first has a row per agent."""
     rows = (worlds * agents, THRUSTERS)
-    if not is_global(policy):
+    if policy.observes == "local":
         return [rows]
     return [rows, (worlds, agents, THRUSTERS), (worlds, agents * THRUSTERS)]
-
-
-def is_global(policy: BasePolicy) -> bool:
-    """Return whether the policy is fed `state()` of all worlds."""
-    return policy.observes == "global"
 
 
 def make_filter(policy: BasePolicy, env: Any, disturbance_bound: float) -> BasePolicy:

@@ -13,7 +13,7 @@ from lagros_benchmarks.report.watched import SingleGame, efforts
 from lagros_benchmarks.run import library
 from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.flying import Attempt
-from lagros_benchmarks.tasks.spacecraft.episodes import is_global, make_filter, shapes_of
+from lagros_benchmarks.tasks.spacecraft.episodes import make_filter, shapes_of
 from lagros_envs import spacecraft_v0
 from lagros_envs.tasks.spacecraft.draw import SpacecraftRenderer
 from lagros_envs.tasks.spacecraft.scenarios import Preset, Scenario, preset_named
@@ -34,7 +34,7 @@ class _World(ClosedLoop):
 
     def seen(self) -> Any:
         """Return one world, or one row for each agent."""
-        if is_global(self.policy):
+        if self.policy.observes == "global":
             return self.env.state()[None]
         return np.stack([self.observation[agent] for agent in self.env.agents])
 
@@ -95,7 +95,7 @@ class SpacecraftGame(SingleGame):
 
     def _nominal(self) -> Any:
         """Return x_d (steps + 1, agents, 6) if the policy plans it at the start, else None."""
-        if not is_global(self._loop.policy):
+        if self._loop.policy.observes == "local":
             return None
         with Attempt():  # what it raises, it will raise in the episode
             plan = _World(self._still, self._planner)

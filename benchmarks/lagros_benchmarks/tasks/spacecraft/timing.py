@@ -11,7 +11,7 @@ import numpy as np
 from lagros_benchmarks.run.flying import Attempt, ask
 from lagros_benchmarks.run.keeping import Keepable
 from lagros_benchmarks.run.library import FloatArray
-from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, is_global
+from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop
 from lagros_envs.tasks.spacecraft.task import THRUSTERS
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.policy import BasePolicy
@@ -61,7 +61,7 @@ def time_policy(env: SpacecraftVectorEnv, policy: BasePolicy, seeds: Sequence[in
     plans: list[float] = []
     raised = 0
     for index, seed in enumerate(seeds):
-        alone = None if is_global(policy) else index % env.num_agents
+        alone = None if policy.observes == "global" else index % env.num_agents
         own: list[float] = []
         with Attempt() as attempt:
             _time_world(loop, seed, alone, own)
