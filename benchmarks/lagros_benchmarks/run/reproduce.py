@@ -8,8 +8,9 @@ machine.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import Any, ClassVar
@@ -36,6 +37,7 @@ from lagros_policies.trained_for import training_of, weights_record
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.intp]
 
+_SHARDS = 20  # pieces of work, where they divide plans and samples
 _POLICIES = ("learned", "tube-mpc", "lagros", "lqr")
 
 
@@ -94,8 +96,12 @@ class ReproduceSettings:
             )
         said = {
             "metric": metric_settings(task),
-            "data": _algorithm_1(how),
-            "rounds": tuple(_round(how, seed) for seed in range(1, how.rounds + 1)),
+            "data": _data(how, how.plans, how.samples, 0),
+            # Each round on episodes of its own.
+            "rounds": tuple(
+                _data(how, how.round_plans, how.round_samples, seed)
+                for seed in range(1, how.rounds + 1)
+            ),
             "between": TrainingSettings(how.hidden, how.round_epochs, how.batch),
             "lagros": TrainingSettings(how.hidden, how.epochs, how.batch),
             "learned": TrainingSettings(how.hidden, how.learned_epochs, how.batch),
@@ -152,20 +158,11 @@ class ReproduceSettings:
         )
 
 
-def _algorithm_1(how: Learning) -> ExpertDataSettings:
+def _data(how: Learning, plans: int, samples: int, seed: int) -> ExpertDataSettings:
+    shards = math.gcd(_SHARDS, plans, samples)
     return ExpertDataSettings(
-        how.plans, how.samples, disturbance_bound=how.disturbance_bound, shards=_shards(how.plans)
+        plans, samples, shards, disturbance_bound=how.disturbance_bound, seed=seed
     )
-
-
-def _round(how: Learning, seed: int) -> ExpertDataSettings:
-    """Return a round of DAgger, on episodes of its own."""
-    whole = replace(_algorithm_1(how), plans=how.round_plans, samples=how.round_samples, seed=seed)
-    return replace(whole, shards=_shards(how.round_plans))
-
-
-def _shards(plans: int) -> int:
-    return 20 if plans % 20 == 0 else 1
 
 
 def _weights(folder: Path, task: Task, name: str) -> Path:
