@@ -37,14 +37,11 @@ class Examined:
     Attributes:
         corners: The matrices at the corners, shape (k, v, n, n).
         remainders: h_i^2 / 8 d^2F/dz_i^2 for each coordinate in which F is interpolated, (k, n, n).
-        effects: What the width of each coordinate does to F, for the choice of the next cut, each
-            of shape (k, n, n).
         empty: Which cells hold no point of the set, shape (k,).
     """
 
     corners: Interval
     remainders: list[Interval]
-    effects: list[Interval]
     empty: BoolArray
 
 
@@ -181,15 +178,15 @@ def remainder(second: Interval, width: FloatArray) -> Interval:
 
 
 def _sizes(found: Examined) -> FloatArray:
-    """Return how large the effects are beside the matrices themselves, shape (k, c)."""
+    """Return how large the remainders are beside the matrices themselves, shape (k, c)."""
     middle = found.corners.midpoint.mean(axis=1)
     values, vectors = np.linalg.eigh(0.5 * (middle + np.swapaxes(middle, -1, -2)))
     basis = vectors / np.sqrt(np.maximum(np.abs(values), 1e-9))[..., None, :]
     turned = np.swapaxes(basis, -1, -2)
     norms = []
-    for effect in found.effects:
-        size = np.abs(turned @ effect.midpoint @ basis)
-        size += np.abs(turned) @ effect.radius @ np.abs(basis)
+    for part in found.remainders:
+        size = np.abs(turned @ part.midpoint @ basis)
+        size += np.abs(turned) @ part.radius @ np.abs(basis)
         norms.append(np.sum(size**2, axis=(-1, -2)))
     if not norms:
         return np.zeros((len(values), 0))
@@ -198,7 +195,7 @@ def _sizes(found: Examined) -> FloatArray:
 
 
 def _halves(cells: Interval, effects: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Halve each cell across the coordinate of the largest effect; ends (2k, c)."""
+    """Halve each cell across the coordinate of the largest remainder; ends (2k, c)."""
     rows = np.arange(len(cells.lower))
     along = np.argmax(np.where(cells.upper > cells.lower, effects, -math.inf), axis=-1)
     cut = cells.midpoint[rows, along]

@@ -115,7 +115,7 @@ class BoxCondition:
             remainder(self._along(cells, place, 2).derivative(2), width[place])
             for place in range(len(self.moving))
         ]
-        return Examined(self.corners(cells), remainders, remainders, self._outside(cells))
+        return Examined(self.corners(cells), remainders, self._outside(cells))
 
     def corners(self, cells: Interval) -> Interval:
         """Enclose the matrices at the corners of cells, shape (k, 2^c, n, n)."""

@@ -26,7 +26,7 @@ class Wave:
         product = ((cells[:, 0] * 9.0).cos() * (cells[:, 1] * 7.0).cos())[:, None, None]
         width = (cells.upper - cells.lower).T
         parts = [remainder(product * -81.0, width[0]), remainder(product * -49.0, width[1])]
-        return Examined(exact(corners), parts, parts, np.zeros(len(cells.lower), dtype=bool))
+        return Examined(exact(corners), parts, np.zeros(len(cells.lower), dtype=bool))
 
     def failure(self, cells):
         middle = cells.midpoint
@@ -71,7 +71,7 @@ class Speck:
             remainder((shifted[axis].cos() * -9.0)[:, None, None], width[axis]) for axis in range(2)
         ]
         empty = np.zeros(len(cells.lower), dtype=bool)
-        return Examined(exact(corners.reshape(-1, 4, 1, 1)), parts, parts, empty)
+        return Examined(exact(corners.reshape(-1, 4, 1, 1)), parts, empty)
 
     def failure(self, cells):
         return None
