@@ -24,15 +24,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagros_envs.dynamics import System
+from lagros_policies.contraction.condition import contraction_residual
 from lagros_policies.contraction.metric import Metric
-from lagros_policies.contraction.regions import BoxRegion
+from lagros_policies.contraction.regions import BoxRegion, Samples
 from lagros_policies.contraction.statement import Statement, at_most
 from lagros_policies.contraction.systems import check_polynomial, check_sizes
 from lagros_policies.proof.bounds import ProvedBounds, metric_bounds, prove_bounds
@@ -59,6 +60,8 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 
+# Far above the rounding of a residual [1/s].
+_SURELY = 1e-6
 # Cells of one pass: enough to hide NumPy's cost per call, few enough to stay in the cache.
 _BATCH = 100
 _HELD_BATCH = 400
@@ -79,6 +82,8 @@ class ContractionProof:
         violation: A point where the condition fails, or None.
         undecided: One cell left undecided, ends (2, c) of the coordinates that matter; None if
             proved or violated.
+        refuted: Whether (*) itself fails, there or where x = x_d is one of its points: (**) asks
+            for more where W_bar or B depends on x.
     """
 
     box: BoxRegion | Provable
@@ -88,6 +93,7 @@ class ContractionProof:
     seconds: float
     violation: Violation | None = None
     undecided: FloatArray | None = None
+    refuted: bool = False
 
 
 @dataclass(frozen=True)
@@ -165,9 +171,21 @@ def prove_contraction(
     condition = BoxCondition(where, rate_matrices(system, metric, rate))
     found = search(condition, _BATCH, most_boxes, most_seconds)
     spent = time.monotonic() - start
+    refuted = _refutes(system, replace(metric, contraction_rate=rate), found.failure)
     return ContractionProof(
-        box, rate, found.proved, found.cells, spent, found.failure, found.undecided
+        box, rate, found.proved, found.cells, spent, found.failure, found.undecided, refuted
     )
+
+
+def _refutes(system: System, metric: Metric, found: Violation | None) -> bool:
+    """Return whether the condition itself fails at x and x_d near where that of the proof does."""
+    if found is None:
+        return False
+    nominal = found.place if metric.point == "nominal" else found.nominal
+    pairs = [(found.state, nominal), (found.nominal,) * 2, (found.state,) * 2]
+    states, nominals = (np.stack(side) for side in zip(*pairs, strict=True))
+    samples = Samples(states, nominals, np.tile(found.control, (len(pairs), 1)))
+    return bool(contraction_residual(system, metric, samples).max() > _SURELY)
 
 
 def largest_proved(
@@ -313,7 +331,7 @@ def contraction_statement(proof: ContractionProof, metric: Metric, where: str) -
         "proved",
         proof.proved,
         proof.seconds,
-        refuted=proof.violation is not None,
+        refuted=proof.refuted,
     )
 
 

@@ -159,6 +159,7 @@ def test_a_metric_that_is_broken_by_its_true_rate_is_refused():
     # The proof, too, says no, and where.
     refused = prove_contraction(Pvtol(), metric, PVTOL_BOX)
     point = refused.violation
+    assert refused.refuted
     assert not refused.proved
     triple = Samples(*(part[None] for part in (point.state, point.nominal, point.control)))
     same = Samples(triple.nominal, triple.nominal, triple.nominal_control)

@@ -281,8 +281,7 @@ def _contraction(
         f"equation (14) on the whole region, alpha = {metric.contraction_rate:g} 1/s, "
         f"control at will{why}"
     )
-    refuted = proof.violation is not None
-    return (Statement(text, "proved", proof.proved, proof.seconds, refuted),)
+    return (Statement(text, "proved", proof.proved, proof.seconds, proof.refuted),)
 
 
 def _theorem_one(
