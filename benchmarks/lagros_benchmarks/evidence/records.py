@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
-import lagros_policies
 from lagros_envs.task import Described
 from lagros_policies.contraction.statement import Statement
-
-
-def weights_folder(task: Described) -> Path:
-    """Return where the metric and the networks of a task lie."""
-    own: Path | None = getattr(task, "weights", None)
-    return own or Path(lagros_policies.__file__).parent / "pretrained"
+from lagros_policies.room import shipped_file
 
 
 def recorded_error(task: Described, policy: str) -> float:
@@ -27,7 +20,7 @@ def recorded_error(task: Described, policy: str) -> float:
         FileNotFoundError: The network has no record.
         ValueError: The record holds no such figure.
     """
-    path = weights_folder(task) / f"{task.name}_{policy}.json"
+    path = shipped_file(task, f"{policy}.json")
     try:
         return float(json.loads(path.read_text())["learning_error"]["maximum"])
     except (KeyError, TypeError, ValueError) as error:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -37,6 +39,8 @@ from lagros_policies.tasks.cartpole.certificate import CartPoleQuestion, cartpol
 from lagros_policies.tasks.cartpole.plans import PlanBox
 from lagros_policies.tasks.cartpole.proof import prove_cartpole
 from lagros_policies.tasks.cartpole.proof_program import ProvedDesignSettings
+
+Kind = TypeVar("Kind")
 
 # The bound that the paper's radius of 3.15 belongs to, by the formula it is computed with.
 PAPER_BOUND = 0.075
@@ -137,13 +141,7 @@ def cartpole_tubes(system: CartPole, bound: float) -> list[ConstantTube]:
         ),
         (_SETTLED, TubeDesign(rate=0.6, output=_ANGLE, disturbance_bound=PAPER_BOUND)),
     ]
-    tubes = []
-    for plan, design in wanted:
-        try:
-            tubes.append(design_contained(system, plan, design))
-        except (InfeasibleError, RuntimeError):
-            continue
-    return tubes
+    return _contained(design_contained, system, wanted)
 
 
 def cartpole_held_tubes(system: CartPole, bound: float) -> list[HeldTube]:
@@ -160,12 +158,17 @@ def cartpole_held_tubes(system: CartPole, bound: float) -> list[HeldTube]:
         (_UPRIGHT, HeldDesign(0.02, 0.4, _ANGLE, disturbance_bound=bound, degree=3)),
         (_SETTLED, HeldDesign(0.1, 0.5, _ANGLE, disturbance_bound=PAPER_BOUND, degree=5)),
     ]
+    return _contained(design_held_contained, system, wanted)
+
+
+def _contained(
+    design: Callable[..., Kind], system: CartPole, wanted: Sequence[tuple[PlanBox, Any]]
+) -> list[Kind]:
+    """Return the tubes that can be designed."""
     tubes = []
-    for plan, design in wanted:
-        try:
-            tubes.append(design_held_contained(system, plan, design))
-        except (InfeasibleError, RuntimeError):
-            continue
+    for plan, settings in wanted:
+        with suppress(InfeasibleError, RuntimeError):
+            tubes.append(design(system, plan, settings))
     return tubes
 
 
