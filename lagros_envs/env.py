@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple, cast
 
 import gymnasium as gym
@@ -22,13 +23,13 @@ from lagros_envs.conventions import (
 )
 from lagros_envs.disturbances import Situation
 from lagros_envs.draw import Frame
-from lagros_envs.dynamics.held import HeldStep
+from lagros_envs.dynamics.held import HeldStep, OnFloats
 from lagros_envs.numbers import functions
 from lagros_envs.of_task import (
     Channels,
     OfTask,
     action_space,
-    actuators,
+    applied,
     contacts,
     disturbance_of,
     meaning_of,
@@ -46,6 +47,7 @@ from lagros_envs.task import LARGEST_DISTANCE, Scenario, Task, distance_between
 
 FloatArray = NDArray[np.float64]
 
+_NOT_YET = End.NOT_YET  # a member of an Enum is looked up slowly
 _READY = 64  # starts that are drawn in advance
 
 
@@ -169,7 +171,8 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
         # Starts that are drawn in advance, the next one last: to draw many takes little longer than
         # to draw one.
         self._ready: list[_Start] = []
-        self._layout = self.settings.layout
+        self._layout, self._options = self.settings.layout, option_names(self.settings)
+        self._time_at = self._layout.time
         self.named_space = named_space(self.settings)
         self.observation_space = cast(
             "spaces.Space[NDArray[np.float32]]", spaces.flatten_space(self.named_space)
@@ -179,11 +182,16 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
         names = self._rules.names
         self._end_at = slice(names.index("reward"), names.index("inside"))
         self._size = names.index("size" if "size" in names else "distance")
-        self._actuators = list(zip(*actuators(self.settings), strict=True))
+        self._n, self._shape = self.settings.system.state_dim, self.action_space.shape
+        m = self.settings.system.control_dim
+        self._apply = OnFloats(partial(applied, self.settings), a=m)
+        self._begin = OnFloats(self._rules.begun, x=self._n, g=self._rules.given)
         self._renderer: Any = None
         self._started = False
+        # An `Outcome`, as far as it is kept, as a plain tuple, which is several times faster.
+        self._outcome: tuple[Any, ...] = ()
         self.nominal: FloatArray | None = None
-        self._end = End.NOT_YET
+        self._end = _NOT_YET
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -201,7 +209,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
         Raises:
             ValueError: The seed is none, or an option is unknown or has a wrong shape or value.
         """
-        options = known_options(options, option_names(self.settings))
+        options = known_options(options, self._options)
         given = stated_scenario(options, self.settings) if options else {}
         nominal = stated_nominal(options, self.settings) if options else None
         if self.disturbance.kind == "worst" and nominal is None:
@@ -219,10 +227,11 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
         self._state, self._goal, _, self._fixed, self._blank = start
         self._step = 0
         self._now = self._clock[0]
-        self._outcome = self._first_outcome()
-        self._push = np.zeros(self.settings.system.state_dim)
+        self._outcome = (0.0, 0.0, 0.0, math.inf) if self._discs else (0.0, 0.0, math.inf)
+        self._outcome, _ = self._begin.run(self._state, self._given())
+        self._push = np.zeros(self._n)
         self._started = True
-        self._end = End.NOT_YET
+        self._end = _NOT_YET
         if self.render_mode == "human":
             self.render()
         return self._observation(), self._info()
@@ -242,11 +251,12 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
             ValueError: The action is not m finite numbers.
             RuntimeError: The environment was not reset.
         """
-        check_started(self._started, "step()")
+        if not self._started:
+            check_started(False, "step()")
         control = self._control(action)
-        if self._end is not End.NOT_YET:
+        if self._end is not _NOT_YET:
             self._end = warned_after(self._end)
-        self._push = self._current_push()
+        self._push = np.zeros(self._n) if self._calm else self._current_push()
         step = self._step = self._step + 1
         self._now = self._clock[step] if step <= self._steps else self._instant(step)
         self._advance(control)
@@ -256,7 +266,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
         if self.render_mode == "human":
             self.render()
         truncated = step >= self._steps
-        if (over or truncated) and self._end is End.NOT_YET:
+        if (over or truncated) and self._end is _NOT_YET:
             self._end = End.REACHED
         return self._observation(), reward, over, truncated, self._info()
 
@@ -336,59 +346,46 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
     def _starts(self, scenarios: Scenario) -> list[_Start]:
         """Return the starts of one scenario or of several."""
         states, goals = np.atleast_2d(scenarios.initial_state, scenarios.goal)
-        discs = self.settings.all_discs(scenarios.discs).reshape(len(states), -1, 3)
         blanks = np.zeros((len(states), self._layout.size), np.float32)
         blanks[:, self._layout.goal], blanks[:, self._layout.initial_state] = goals, states
-        blanks[:, self._layout.discs] = discs.reshape(len(states), -1)
-        fixed = np.concatenate([contacts(self.settings, discs), goals], axis=1)
-        first, second, last = (map(tuple, part.tolist()) for part in (states, goals, fixed))
-        return [_Start(*one) for one in zip(first, second, discs, last, blanks, strict=True)]
+        first, second = list(map(tuple, states.tolist())), list(map(tuple, goals.tolist()))
+        last, discs = second, np.zeros((len(first), 0, 3))
+        if self._discs:
+            discs = self.settings.all_discs(scenarios.discs).reshape(len(states), -1, 3)
+            blanks[:, self._layout.discs] = discs.reshape(len(states), -1)
+            fixed = np.concatenate([contacts(self.settings, discs), goals], axis=1)
+            last = list(map(tuple, fixed.tolist()))
+        return list(map(_Start, first, second, discs, last, blanks))
 
     def _control(self, action: NDArray[np.float32]) -> tuple[float, ...]:
-        known = type(action) is np.ndarray and action.dtype.char in "fd"
-        known = known and action.shape == (len(self._actuators),)
-        values = action.tolist() if known else [math.nan]
+        if type(action) is np.ndarray and action.shape == self._shape and action.dtype.char in "fd":
+            values = action.tolist()
+        else:
+            values = [math.nan]
         if not math.isfinite(sum(values)):
             # Slower, and with a message.
-            shape = (len(self._actuators),)
+            shape = (self.settings.system.control_dim,)
             values = checked_actions(action, shape, meaning_of(self.settings)).tolist()
-        control = []
-        for value, (centre, scale, low, high) in zip(values, self._actuators, strict=True):
-            one = centre + scale * value
-            # Comparisons: calling min and max takes three times as long.
-            control.append(one if low <= one <= high else high if one > high else low)
-        return tuple(control)
+        control, _ = self._apply.run(values)
+        return control
 
     def _given(self) -> tuple[float, ...]:
         """Return what the rules are given of this step, see `rules.Given`."""
-        if self._discs:
-            x, y = self.settings.position
-            start = self._state[x], self._state[y]
-            return (*start, *self._fixed, *self._now, *self._outcome[:4])
-        return (*self._fixed, *self._now, *self._outcome[:3])
-
-    def _first_outcome(self) -> tuple[Any, ...]:
-        """Return what is known of an episode at its start: an `Outcome`, as far as it is kept."""
-        task = self.settings
-        distance = task.goal_distance(self._state, self._goal, functions)
-        inside = distance <= self._now[1] and not task.fallen(self._state, functions)
-        outcome = (0.0, 0.0, 0.0 if inside else math.inf, distance, 0.0, False, inside)
         if not self._discs:
-            return outcome
-        place = [self._state[index] for index in task.position]
-        discs = [self._fixed[k : k + 3] for k in range(0, 3 * task.most_discs, 3)]
-        touching = self._rules.touching(place, place, discs)
-        return (1.0 if touching else 0.0, *outcome)
+            return (*self._fixed, *self._now, *self._outcome[:3])
+        x, y = self.settings.position
+        start = self._state[x], self._state[y]
+        return (*start, *self._fixed, *self._now, *self._outcome[:4])
 
     def _advance(self, control: tuple[float, ...]) -> None:
         """Move the state over one control step, whose end `_step` counts already, and judge it."""
-        given = self._given()
+        given = self._given() if self._discs else (*self._fixed, *self._now, *self._outcome[:3])
         run = self._hold.run
         try:
             if self._calm:
                 state, outcome = run(self._state, control, given)
             else:
-                state, outcome = run(self._state, control, tuple(self._push.tolist()), given)
+                state, outcome = run(self._state, control, self._push.tolist(), given)
         except (OverflowError, ValueError):  # an infinity has no sine
             pass
         else:
@@ -403,8 +400,6 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
         return time, float(self.settings.success_radius(time))
 
     def _current_push(self) -> FloatArray:
-        if self._calm:
-            return np.zeros(self.settings.system.state_dim)
         if self._pushes is None:
             drawn = self._stepwise.step(self._step, cast(SharedStreams, self._shared).disturbance)[
                 :, 0
@@ -427,13 +422,13 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
         # One by one: a few floats become an array more slowly than they are stored.
         for index, value in enumerate(self._state):
             observation[index] = value
-        observation[self._layout.time] = self._now[0]
+        observation[self._time_at] = self._now[0]
         return observation
 
     def _info(self) -> dict[str, Any]:
         known = self._outcome[1:] if self._discs else self._outcome
         effort, effort_to_success, success_time, distance, _, fallen, inside = known[:7]
-        success = success_time != math.inf
+        success = success_time < math.inf
         if self._discs:
             collided = self._outcome[0] > 0.0
             success = success and not collided

@@ -15,6 +15,7 @@ from lagros_envs.checks import check_instance
 from lagros_envs.conventions import settings_of
 from lagros_envs.disturbances import Disturbance, channel_mask
 from lagros_envs.numbers import functions
+from lagros_envs.numbers.functions import where
 from lagros_envs.options import nominal_option, option_numbers
 from lagros_envs.registry import task_named
 from lagros_envs.task import LARGEST_CONTROL, Numbers, Scenario, Task
@@ -85,6 +86,16 @@ def actuators(task: Task) -> tuple[Numbers, Numbers, Numbers, Numbers]:
     low = tuple(max(one, -LARGEST_CONTROL) for one in task.control_low)
     high = tuple(min(one, LARGEST_CONTROL) for one in task.control_high)
     return centre, task.control_scale, low, high
+
+
+def applied(task: Task, action: Sequence[Any]) -> list[Any]:
+    """Return `Task.control` of one action, m numbers of any kind that can be compared."""
+    control = []
+    for value, centre, scale, low, high in zip(action, *actuators(task), strict=True):
+        moved = centre + scale * value
+        moved = where(moved > low, moved, low)
+        control.append(where(moved > high, high, moved))
+    return control
 
 
 def meaning_of(task: Task) -> str:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
+from lagros_envs.numbers import functions as elementary
 from lagros_envs.numbers.functions import where
 from lagros_envs.task import Task
 
@@ -109,6 +110,10 @@ class StepRules:
         """Judge a step by x at its end, u and the numbers of `Given`; see `names`."""
         judged: tuple[Any, ...] = self._judged(state, control, self._read(given), functions)
         return judged[self.kept]
+
+    def begun(self, state: Sequence[Any], given: Sequence[Any]) -> tuple[Any, ...]:
+        """Judge the start of an episode: as if a step without effort had ended there."""
+        return self(state, self.task.control_centre, given, elementary)
 
     def lost(
         self, state: Sequence[Any], control: Sequence[Any], given: Sequence[Any], functions: Any

@@ -64,8 +64,7 @@ def distance_between(first: Sequence[Any], second: Sequence[Any], functions: Any
     return functions.sqrt(total)
 
 
-def _no_discs() -> FloatArray:
-    return np.zeros((0, 3))
+NO_DISCS = np.zeros((0, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +79,7 @@ class Scenario(ByValue):
 
     initial_state: FloatArray
     goal: FloatArray
-    discs: FloatArray = field(default_factory=_no_discs)
+    discs: FloatArray = field(default_factory=lambda: NO_DISCS)
 
     def __post_init__(self) -> None:
         """Make the arrays read-only."""

@@ -294,18 +294,13 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
         scenario = scenario_with(drawn, stated)
         count = len(scenario.initial_state)
         kept = np.zeros((rows.count, count))
-        state, goal = kept[rows.state], kept[rows.goal]
-        state[:], goal[:] = scenario.initial_state.T, scenario.goal.T
-        kept[rows.distance] = task.goal_distance([*state], [*goal], functions)
-        kept[rows.radius] = self._radii[0]
-        inside = kept[rows.distance] <= self._radii[0]
-        kept[rows.inside] = inside & ~np.broadcast_to(task.fallen([*state], functions), (count,))
-        kept[rows.success_time] = np.where(kept[rows.inside], 0.0, np.inf)
+        state = kept[rows.state]
+        state[:], kept[rows.goal] = scenario.initial_state.T, scenario.goal.T
+        kept[rows.radius], kept[rows.success_time] = self._radii[0], np.inf
         if rows.collided is not None:
+            kept[rows.start] = state[list(task.position)]
             kept[rows.discs] = contacts(task, scenario.discs).T
-            place = [*state[list(task.position)]]
-            discs = [*kept[rows.discs].reshape(-1, 3, count)]
-            kept[rows.collided] = self._rules.touching(place, place, discs)
+        kept[rows.outcome] = np.broadcast_arrays(*self._rules.begun([*state], [*kept[rows.given]]))
         blank = np.zeros((count, layout.size), np.float32)
         blank[:, layout.goal], blank[:, layout.initial_state] = (
             scenario.goal,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Hashable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, cast
 
 import numpy as np
@@ -17,11 +18,12 @@ from lagros_envs.dynamics.straight_line import (
     recorded_hold,
     recorded_measure,
     scalar_source,
+    straight_line,
 )
 from lagros_envs.dynamics.system import System
 
 FloatArray = NDArray[np.float64]
-# From x, u, d and what is given, tuples of floats, to x at the end and what is measured there.
+# From x, u, d and what is given, sequences of floats, to x at the end and what is measured there.
 FloatStep = Callable[..., tuple[tuple[float, ...], tuple[Any, ...]]]
 
 
@@ -37,7 +39,7 @@ class HeldStep:
         pushed: Whether there is a disturbance; it costs a tenth of the step.
 
     Attributes:
-        run: From x, u, d (if there is one) and what is given (if anything is), each a tuple of
+        run: From x, u, d (if there is one) and what is given (if anything is), sequences of
             floats, to x at the end and what the measure computed. It raises ValueError for the
             sine of an infinity, or returns nan where it is compiled.
 
@@ -65,6 +67,34 @@ class HeldStep:
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what the step is made from: a recorded function has no name to be found by."""
         return HeldStep, self._made_from
+
+
+class OnFloats:
+    """A function of several groups of numbers, recorded and written out for floats.
+
+    Args:
+        function: From the groups to its results; not more of these than numbers.
+        sizes: How many numbers each group has, by a letter.
+
+    Attributes:
+        run: From the groups, sequences of floats, to the results and an empty tuple.
+    """
+
+    def __init__(self, function: Callable[..., Sequence[Any]], **sizes: int) -> None:
+        """Record the function."""
+        self._made_from = function, sizes
+        ends = list(itertools.accumulate(sizes.values(), initial=0))
+        names = [f"{letter}{k}" for letter, size in sizes.items() for k in range(size)]
+
+        def flat(numbers: Sequence[Any]) -> Sequence[Any]:
+            return function(*(numbers[one:two] for one, two in itertools.pairwise(ends)))
+
+        self.run = float_function(scalar_source(straight_line(flat, names), 1, grouped=True))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what it is made from, as `HeldStep` does."""
+        function, sizes = self._made_from
+        return partial(OnFloats, function, **sizes), ()
 
 
 class HeldBatch:
@@ -188,7 +218,14 @@ def _float_step(
     if compiled:
         from lagros_envs.dynamics.compiled import compiled_function
 
-        return cast(FloatStep, compiled_function(source))
+        function = compiled_function(source)
+        # Lists are slow to get into what numba has compiled.
+        return lambda *groups: cast(Any, function(*map(tuple, groups)))
+    return float_function(source)
+
+
+def float_function(source: str) -> FloatStep:
+    """Return the function of a module that `straight_line.scalar_source` has written."""
     # Our own text: operators, the names of the inputs, and the numbers of the system.
     namespace: dict[str, Any] = {}
     exec(compile(source, "<held step>", "exec"), namespace)
