@@ -128,7 +128,7 @@ class RestartingVectorEnv(Conforming, gym.vector.VectorEnv[Float32Array, Float32
             raise ValueError(
                 f"render_mode={render_mode!r}: the vector environment does not draw; use {drawn_by}"
             )
-        check_step_limit(max_episode_steps, settings)
+        check_step_limit(max_episode_steps, settings, self._usual_steps())
         self._step_limit = min(settings.steps, max_episode_steps or settings.steps)
         self.num_envs, self.num_worlds = num_envs, num_worlds
         self.single_observation_space = single_observation_space

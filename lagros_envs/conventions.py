@@ -57,6 +57,10 @@ class Conforming:
         """Control steps after which an episode is truncated."""
         return self.settings.steps
 
+    def _usual_steps(self) -> int:
+        """Return the limit that the id is registered with."""
+        return type(self.settings)().steps
+
     def __copy__(self) -> Self:
         """Return a copy that shares nothing: one that shared arrays would step both."""
         return copy.deepcopy(self)
@@ -74,13 +78,13 @@ class Conforming:
             ValueError: `gym.make` was given settings and a limit of steps that contradict.
         """
         if value is not None:
-            check_step_limit(_limit_from_make(), self.settings)
+            check_step_limit(_limit_from_make(), self.settings, self._usual_steps())
             # The environment truncates by itself, with Gymnasium's wrapper around it or without.
             value = replace(value, kwargs=plain(value.kwargs), max_episode_steps=self.step_limit)
         self._spec = value
 
 
-def check_step_limit(limit: int | None, settings: LimitedSettings) -> None:
+def check_step_limit(limit: int | None, settings: LimitedSettings, usual: int) -> None:
     """Check Gymnasium's `max_episode_steps` against the task's own time limit.
 
     An id is registered with the limit of the default settings, which so stands for none being
@@ -89,6 +93,7 @@ def check_step_limit(limit: int | None, settings: LimitedSettings) -> None:
     Args:
         limit: Control steps; None for no limit.
         settings: The task.
+        usual: The limit that the id is registered with.
 
     Raises:
         ValueError: The limit is not a positive number, is longer than the task's, or is that of
@@ -97,7 +102,6 @@ def check_step_limit(limit: int | None, settings: LimitedSettings) -> None:
     if limit is None:
         return
     check_whole("max_episode_steps", limit)
-    usual = type(settings)().steps
     if limit > settings.steps and limit != usual:
         raise ValueError(
             f"max_episode_steps={limit} is beyond the {settings.steps} control steps of "

@@ -44,6 +44,9 @@ class OfTask:
         self.usual = cast(Task, found)
         return settings_of(self.usual, settings)
 
+    def _usual_steps(self) -> int:
+        return self.usual.steps
+
 
 def disturbance_of(
     task: Task, kind: Any, bound: float | None, channels: Channels, metric: Any
