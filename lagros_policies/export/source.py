@@ -86,6 +86,9 @@ def exported_names() -> list[str]:
     return [f"{policy}-{task}" for task in task_names() for policy in _POLICIES]
 
 
+NAMES = tuple(exported_names())  # the older name of `exported_names`
+
+
 def parted(name: str) -> tuple[str, Described]:
     """Return a policy's name and its task.
 

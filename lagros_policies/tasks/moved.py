@@ -67,6 +67,10 @@ NAMES = {
         "Lipschitz": f"{_CARTPOLE}.lipschitz",
         "metric_drift": "lagros_policies.proof.bounds",
     },
+    "lagros_policies.export": {
+        "NAMES": "lagros_policies.export.source",
+        "SpacecraftSource": f"{_SPACECRAFT}.export",
+    },
     "lagros_policies.remarks.adaptive": f"{_CARTPOLE}.remarks",
     "lagros_policies.tasks.cartpole.remarks": {
         "SlidingCentralizedPolicy": "lagros_policies.tasks.spacecraft.sliding",
