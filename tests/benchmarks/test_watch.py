@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from lagros_benchmarks.commands import cli
 from lagros_benchmarks.report import video
-from lagros_benchmarks.report.pictures import SinglePictures
 from lagros_benchmarks.report.playback import Playback, WatchSettings
+from lagros_benchmarks.report.watched import SinglePictures
 from lagros_benchmarks.tasks.spacecraft import game
 from lagros_envs import spacecraft_v0
 from lagros_envs.tasks.cartpole.task import CartPoleSettings

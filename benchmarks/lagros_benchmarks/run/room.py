@@ -27,7 +27,7 @@ class Room:
         fly_scene: Flies that world.
         reproduced: Name of the figure of `lagros reproduce`.
         game: What `lagros watch` plays.
-        attack: Episodes and search of an attack, a `worst_case.attack.Bench`.
+        attack: Episodes and search of an attack, a `worst_case.single.SingleBench`.
         certify: The certificate.
         reproduce: Everything from nothing.
         train: How it is learned by reinforcement, a `training.course.SingleCourse`.

@@ -31,7 +31,7 @@ _MOVED = {
     "formats": "report.formats",
     "tables": "report.tables",
     "records": "report.records",
-    "pictures": "report.pictures",
+    "pictures": "report.watched",
     "playback": "report.playback",
     "video": "report.video",
     "watched": "report.watched",

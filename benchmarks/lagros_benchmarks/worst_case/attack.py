@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
 from time import perf_counter
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,33 +36,6 @@ Progress = Callable[[str], None]
 _BASELINE = "uniform"
 # A sequence may pass its bound by rounding alone.
 _ROUNDING = 1e-12
-
-
-class Bench(Protocol):
-    """What a task brings to an attack: `worst_case.single.SingleBench`, or that of its room.
-
-    Attributes:
-        population: Flights per question of an optimiser, by default.
-        shape: Of the pushes of one episode.
-    """
-
-    population: int
-    shape: tuple[int, ...]
-
-    def prepare(self, say: Progress) -> None:
-        """Build everything that flies."""
-
-    def search(self, say: Progress) -> list[Found]:
-        """Search the worst sequence of every episode."""
-
-    def random(self, kind: str) -> FloatArray:
-        """Return the random disturbance of every episode."""
-
-    def replay(self, pushes: FloatArray) -> list[Outcome]:
-        """Fly a sequence in each episode."""
-
-    def figures(self) -> dict[str, Any]:
-        """Return what the row of the attack says besides."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +102,7 @@ class Attack:
 
 
 def bench_of(task: str) -> Any:
-    """Return the class of a task's `Bench`."""
+    """Return what a task brings to an attack: `SingleBench`, or a class like it of its room."""
     return room_of(find_task(task)).part("attack")
 
 
@@ -144,7 +117,7 @@ def run_attack(settings: AttackSettings, progress: Progress | None = None) -> At
         ValueError: The policy keeps a memory, or has no certificate to attack.
     """
     say = progress or (lambda _: None)
-    bench: Bench = bench_of(settings.task)(settings)
+    bench = bench_of(settings.task)(settings)
     bench.prepare(say)
     begun = perf_counter()
     found = bench.search(say)
@@ -166,10 +139,11 @@ def fly_again(cases: WorstCases) -> list[Outcome]:
     """
     settings = settings_from(cases.command)
     check_bound(cases.pushes, settings.bound)
-    bench: Bench = bench_of(settings.task)(settings)
+    bench = bench_of(settings.task)(settings)
     check_shape(cases.pushes, settings, bench.shape)
     bench.prepare(lambda _: None)
-    return bench.replay(cases.pushes)
+    flown: list[Outcome] = bench.replay(cases.pushes)
+    return flown
 
 
 def settings_from(command: Any) -> AttackSettings:

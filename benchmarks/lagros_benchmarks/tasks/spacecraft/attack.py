@@ -37,7 +37,7 @@ _PLANE = [0, 3]
 
 
 class SpacecraftBench:
-    """The worlds of an attack; see `worst_case.attack.Bench`.
+    """The worlds of an attack; see `worst_case.single.SingleBench`.
 
     Args:
         settings: An `AttackSettings`.
