@@ -287,7 +287,7 @@ def _bounds(
         near to binding, without which the program has another optimum.
 
     Raises:
-        RuntimeError: It is not positive between the angles of a grid, which no place is added to.
+        RuntimeError: It is not positive between the points of a grid, which no place is added to.
     """
 
     def dual(place: FloatArray) -> FloatArray:
@@ -301,7 +301,7 @@ def _bounds(
     least, largest = float(eigenvalues.min()), float(eigenvalues.max())
     if grid and least <= 0.0:
         raise RuntimeError(
-            "CV-STEM gave a W_bar that is not positive between the angles of its grid; try another "
+            "CV-STEM gave a W_bar that is not positive between the points of its grid; try another "
             "degree or scaling"
         )
     kept = least >= 1.0 - _BOUND_SLACK and largest <= bound * (1.0 + _BOUND_SLACK)

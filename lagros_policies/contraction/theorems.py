@@ -1,14 +1,14 @@
 """The paper's theorems as functions, where no other module has them, with what they leave out.
 
 `tube.Tube` is Theorem 1, `tube.diverging_bound` Lemma 1, `control.robust_control` the u* of
-Theorem 2, `tube.tighten` Theorem 3 and `imitation.dataset.tube_states` the way of sampling of
+Theorem 2, `tube.tighten` Theorem 3 and `learning.dataset` has the way of sampling of
 Theorem 4 that the networks were trained with.
 
 **Theorem 1 and a metric that depends on the state.** With V = e'M(x)e the disturbance moves x and
-so M: dV/dt has the term sum_i d_i e'(dM/dx_i)e, which the proof leaves out. For a metric of the
-angle alone |e'(dM/dtheta)e| <= kappa V with -kappa W <= dW/dtheta <= kappa W, so that the tube
-holds with alpha - kappa d_theta / 2 in place of alpha. A learning error enters through B, which
-moves no angle, and adds nothing to it.
+so M: dV/dt has the term sum_i d_i e'(dM/dx_i)e, which the proof leaves out. For a metric of
+one coordinate |e'(dM/dx_i)e| <= kappa V with -kappa W <= dW/dx_i <= kappa W, so that the tube holds
+with alpha - kappa d_i / 2 in place of alpha. A learning error enters through B, which moves no
+coordinate of a metric of x, and adds nothing to it.
 
 **Theorem 2, -nu or -2 nu.** For K = -s R^-1 B'M (s = 1 in the proof)
 
@@ -36,18 +36,18 @@ __getattr__ = moved_names(__name__)
 FloatArray = NDArray[np.float64]
 
 
-def disturbed_rate(metric: Metric, drift: float, angle_disturbance: float) -> float:
-    """Return alpha - kappa d_theta / 2, the rate of Theorem 1 with the disturbance in dM/dt [1/s].
+def disturbed_rate(metric: Metric, drift: float, disturbance: float) -> float:
+    """Return alpha - kappa d_i / 2, the rate of Theorem 1 with the disturbance in dM/dt [1/s].
 
     Args:
         metric: The metric.
         drift: kappa of `metric_drift` [1/rad].
-        angle_disturbance: Bound of the disturbance of the angle's own equation [rad/s]; d_bar, if
-            it is not known to be less, and zero if only the rates are disturbed.
+        disturbance: Bound of the disturbance of the metric's one coordinate, per second; d_bar, if
+            it is not known to be less, and zero if it is not disturbed.
     """
     check_not_negative("drift", drift)
-    check_not_negative("angle_disturbance", angle_disturbance)
-    return metric.contraction_rate - 0.5 * drift * angle_disturbance
+    check_not_negative("disturbance", disturbance)
+    return metric.contraction_rate - 0.5 * drift * disturbance
 
 
 def feasibility_residual(system: System, metric: Metric, samples: Samples) -> FloatArray:

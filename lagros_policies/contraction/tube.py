@@ -72,7 +72,7 @@ def certified_tube(
 
     It bounds the continuous-time loop while the state stays in the metric's region and the
     disturbance does not move M; the metric's condition was checked on samples, so the bound is
-    observed, not proved. Where the disturbance moves the angle, and M depends on it, the theorem
+    observed, not proved. Where the disturbance moves what M depends on, the theorem
     leaves out a term: what follows then has `theorems.disturbed_rate` in alpha's place, and nothing
     follows where that is not positive.
 

@@ -42,7 +42,7 @@ from lagros_policies.contraction import (
     verify_metric,
 )
 from lagros_policies.contraction.double_integrator import design_axis
-from lagros_policies.proof import bounds, sets
+from lagros_policies.proof import bounds, hold, sets
 from lagros_policies.proof import condition as proof_condition
 from lagros_policies.remarks import adaptive, lagrangian, stochastic
 from lagros_policies.tasks.cartpole import (
@@ -365,7 +365,7 @@ def cartpole_calls(system: Any) -> Iterator[tuple[Callable[..., Any], Callable[[
         proof_condition.largest_proved: lambda f: f(system, metric, BOX),
         proof_cartpole.prove_cartpole: lambda f: f(metric, BOX, system),
         proof_design.design_proved: lambda f: f(whole, system),
-        proof_condition.prove_hold: lambda f: f(system, metric, BOX),
+        hold.prove_hold: lambda f: f(system, metric, BOX),
         sets.triples: lambda f: f(BOX, system, "state"),
         sets.held_triples: lambda f: f(BOX, system),
         lipschitz.lipschitz_constant: lambda f: f(system, BOX),
@@ -441,7 +441,7 @@ def test_what_proves_takes_a_polynomial_of_the_states_of_the_system():
         bounds.prove_bounds(CartPole(), network, [0.0] * 4, [1.0] * 4)
     with pytest.raises(TypeError, match="must be a Metric"):
         bounds.metric_drift(network, 0.0, 0.5)
-    for function in (proof_condition.prove_contraction, proof_condition.prove_hold):
+    for function in (proof_condition.prove_contraction, hold.prove_hold):
         with pytest.raises(TypeError, match="must be a Metric"):
             function(CartPole(), network, BOX)
         with pytest.raises(ValueError, match=r"scaling of shape \(6,\)"):

@@ -16,7 +16,7 @@ from lagros_policies.contraction.double_integrator import certified_margin, desi
 from lagros_policies.contraction.ellipsoid import prove_tube
 from lagros_policies.contraction.statement import at_most
 from lagros_policies.contraction.tube_design import TubeDesign, design_contained
-from lagros_policies.proof import condition
+from lagros_policies.proof import hold
 from lagros_policies.proof.condition import prove_contraction
 from lagros_policies.proof.families import BoxCondition, held_ends, rate_matrices
 from lagros_policies.tasks.cartpole.box import ProofBox
@@ -55,7 +55,7 @@ def test_a_metric_that_is_none_where_a_hold_ends_is_refused(system, proved, monk
     asked = {"system": system, "held_box": SMALL}
     assert prove_cartpole(proved, SMALL, **asked).statements[-1].holds
     far = [exact(np.full(1, 1.3))] * 4
-    monkeypatch.setattr(condition, "held_ends", lambda *_: (far, far))
+    monkeypatch.setattr(hold, "held_ends", lambda *_: (far, far))
     found = prove_cartpole(proved, SMALL, **asked)
     assert found.held.search.proved
     assert not found.held.proved

@@ -71,7 +71,9 @@ def prove_cartpole(
     )
     after = max(abs(end) for end in held.ends[ANGLE])
     where = describe(replace(held_box, **_NO_ERRORS))
-    lines.append(held_statement(held, rate, period, where, f"|theta| <= {at_most(after)} rad"))
+    lines.append(
+        held_statement(held, rate, period, where, f"|theta| <= {at_most(after)} rad", "force")
+    )
     return Proof(lines, proof, bounds, held)
 
 
