@@ -58,8 +58,7 @@ class ResidualPolicy(BasePolicy):
     ) -> None:
         """Load both networks; see the class for the arguments."""
         self.settings = task_of(settings)
-        base_task: Any = self.settings
-        self.base = LagrosPolicy(base_task, base, allow_other_settings)
+        self.base = LagrosPolicy(self.settings, base, allow_other_settings)
         self.correction = Correction(self.settings, weights, allow_other_settings)
 
     @property

@@ -127,6 +127,7 @@ def test_the_rest_of_a_problem_is_the_problem_of_the_rest():
         problem_of(task, scenario, task.steps - 12, start),
         discs=replace(problem.discs, margin=problem.discs.margin[-13:]),
     )
+    np.testing.assert_array_equal(rest.discs.required(12), by_hand.discs.required(12))
     ours, theirs = solve_scp(rest), solve_scp(by_hand)
     assert np.array_equal(ours.states, theirs.states)
     assert problem.steps == task.steps
