@@ -39,6 +39,8 @@ class OfTask:
         """Return the task from what the environment was given."""
         if task is None:
             task = settings if isinstance(settings, Task) and not self.task_name else self.task_name
+        if not task:
+            raise ValueError("this environment is of any task: pass the task, or the name of one")
         found = task_named(task) if isinstance(task, str) else task
         check_instance("task", found, Task)
         self.usual = cast(Task, found)

@@ -102,26 +102,23 @@ def register_task(task: Task) -> Task:
     from lagros_envs.check_task import check_task
 
     check_task(task)
+    if task.name in SHIPPED and type(task) is type(task_named(task.name)):
+        return task
+    whose = f"name={task.name!r}, title={task.title!r}"
+    for name, shipped in SHIPPED.items():
+        if name == task.name or shipped.title == task.title:
+            raise ValueError(
+                f"{whose} are taken by the task {name!r} of this package; choose others"
+            )
     for name, known in _FOUND.items():
         # A file that is read again, or a cell of a notebook, makes the same class anew.
-        same = type(known).__qualname__ == type(task).__qualname__
-        same = same and _origin(known) == _origin(task)
+        same = _class_of(known) == _class_of(task)
         if (name == task.name or known.title == task.title) and not same:
             raise ValueError(
-                f"name={task.name!r}, title={task.title!r} are those of another task, "
-                f"{type(known).__qualname__} of {_origin(known)}; choose others"
-            )
-    for name, shipped in SHIPPED.items():
-        if (name == task.name) != (shipped.title == task.title) or (
-            name == task.name and type(task) is not type(task_named(name))
-        ):
-            raise ValueError(
-                f"name={task.name!r}, title={task.title!r} are taken by the task {name!r} of this "
-                "package; choose others"
+                f"{whose} are those of another task, {' of '.join(_class_of(known))}; choose others"
             )
     _FOUND[task.name] = task
-    if task.name not in SHIPPED:
-        register_env(task.name, Shipped("", task.title, task.steps))
+    register_env(task.name, Shipped("", task.title, task.steps))
     return task
 
 
@@ -139,8 +136,8 @@ def register_env(name: str, shipped: Shipped) -> None:
     )
 
 
-def _origin(task: Described) -> str:
-    return type(task).__module__
+def _class_of(task: Described) -> tuple[str, str]:
+    return type(task).__qualname__, type(task).__module__
 
 
 def _registered(task: Described) -> Described:
