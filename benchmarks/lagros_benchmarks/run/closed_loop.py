@@ -15,8 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from lagros_benchmarks.run.flying import ask, counted, rehearse, reseed
+from lagros_benchmarks.run.flying import AnswerError, ask
+from lagros_benchmarks.run.library import SetupError, describe_error
+from lagros_benchmarks.run.process import undone
 from lagros_envs.conventions import beyond_the_end
+from lagros_envs.seeding import episode_streams
 from lagros_policies.policy import as_policy
 
 
@@ -92,9 +95,11 @@ class ClosedLoop:
 
     def decide(self) -> None:
         """Ask the policy for its action; what it draws comes from the stream of the first seed."""
-        if self.step == 0:
-            reseed(self.policy, self._seed if np.ndim(self._seed) == 0 else self._seed[0])
-        seen, first = self.seen(), self.step == 0
+        first = self.step == 0
+        if first and self.policy.draws:
+            seed = self._seed if np.ndim(self._seed) == 0 else self._seed[0]
+            self.policy.reseed(episode_streams(seed).policy)
+        seen = self.seen()
         starts = [first] if seen.ndim == 1 else np.full(len(seen), first)
         answer = ask(self.policy, seen, self.memory, starts, *self._shapes)
         self.action, self.memory, seconds = answer
@@ -123,24 +128,39 @@ class ClosedLoop:
         self.step += 1
 
     def counters(self) -> dict[str, int]:
-        """Return what the policy has counted."""
-        return counted(self.policy, self.memory)
+        """Return what the policy has counted in its memory."""
+        if self.memory is None:
+            return {}
+        return {str(name): int(n) for name, n in self.policy.counters(self.memory).items()}
 
     def rehearse(self, what: str, seed: Any = 0, options: dict[str, Any] | None = None) -> None:
-        """Ask the policy once before it flies; see `flying.rehearse`.
+        """Ask the policy once before it flies, so that one that cannot run ends the command.
+
+        Its first call also loads what the timed ones need. Whatever else it raises here it will
+        raise in its episodes, where it is written down.
 
         Args:
-            what: What to call it in a message.
+            what: What to call it in a message, "policy 'mine:Lean'" for instance.
             seed: As for `fly`.
             options: As for `fly`.
 
         Raises:
-            SetupError: It cannot run.
+            SetupError: A package is missing, or it answers by something that is no action of this
+                task.
         """
         self.begin(seed, options)
-        seen = self.seen()
-        starts = np.ones(len(seen) if seen.ndim > 1 else 1, bool)
-        rehearse(what, self.policy, seen, starts, *self._shapes)
+        try:
+            with undone():
+                self.decide()
+        except AnswerError as error:
+            text = describe_error(error).partition(": ")[2]
+            raise SetupError(f"{what} cannot fly: {text}") from error
+        except ImportError as error:
+            raise SetupError(f"{what} cannot fly: {describe_error(error)}") from error
+        except KeyboardInterrupt:
+            raise
+        except BaseException:
+            return
 
     def seen(self) -> Any:
         """Return what the policy is fed now."""

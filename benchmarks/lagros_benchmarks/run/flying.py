@@ -1,4 +1,4 @@
-"""How a policy is asked, seeded and counted, and what becomes of what it raises.
+"""How a policy is asked, and what becomes of what it raises.
 
 Every command flies policies through this module, whatever its loop. A policy is a stranger: it gets
 copies, its answers are checked, and whatever it raises is the failure of its episode. Only
@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_benchmarks.run.library import SetupError, describe_error
-from lagros_benchmarks.run.process import ProcessState, undone
-from lagros_envs.seeding import episode_streams
+from lagros_benchmarks.run.library import describe_error
+from lagros_benchmarks.run.process import ProcessState
 from lagros_policies.policy import BasePolicy
 
 Float32Array = NDArray[np.float32]
@@ -150,55 +149,6 @@ def _said(answer: Any) -> str:
     if isinstance(answer, tuple | list):
         return f"a {type(answer).__name__} of {len(answer)} values"
     return "None" if answer is None else f"a value of type {type(answer).__name__}"
-
-
-def reseed(policy: BasePolicy, seed: int) -> None:
-    """Give a policy that draws the stream of an episode."""
-    if policy.draws:
-        policy.reseed(episode_streams(seed).policy)
-
-
-def counted(policy: BasePolicy, state: Any) -> dict[str, int]:
-    """Return what a policy has counted in its memory; nothing for one that counts nothing."""
-    if state is None:
-        return {}
-    return {str(name): int(count) for name, count in policy.counters(state).items()}
-
-
-def rehearse(
-    what: str, policy: BasePolicy, observation: Any, starts: Any, *shapes: tuple[int, ...]
-) -> None:
-    """Ask a policy once before it flies, so that one that cannot run ends the command at once.
-
-    Its first call also loads what the timed ones need. Whatever else it raises here it will raise
-    in its episodes, where it is written down.
-
-    Args:
-        what: What to call it in a message, "policy 'mine:Lean'" for instance.
-        policy: The policy.
-        observation: An observation, or a batch of them.
-        starts: Which rows start an episode.
-        shapes: As for `ask`.
-
-    Raises:
-        SetupError: A package is missing, or it answers by something that is no action of this task.
-    """
-    try:
-        with undone():
-            reseed(policy, 0)
-            ask(policy, observation, None, starts, *shapes)
-    except (AnswerError, ImportError) as error:
-        raise SetupError(f"{what} cannot fly: {describe(error)}") from error
-    except KeyboardInterrupt:
-        raise
-    except BaseException:
-        return
-
-
-def describe(error: Exception) -> str:
-    """Return the text of an exception on one line, after its type unless it is ours."""
-    text = describe_error(error)
-    return text.partition(": ")[2] if isinstance(error, AnswerError) else text
 
 
 def raised_line(raised: Iterable[tuple[str, int, int]]) -> str:
