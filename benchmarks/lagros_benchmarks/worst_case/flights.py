@@ -25,6 +25,7 @@ from lagros_envs.task import LARGEST_DISTANCE, Scenario, Task, distance_between
 from lagros_policies.expert import Expert
 from lagros_policies.planning.planner import Planner, planner_of
 from lagros_policies.planning.trajectory import Trajectory
+from lagros_policies.room import shipped_file
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -114,7 +115,8 @@ def expert_of(task: Task) -> Expert | Planning:
     Raises:
         FileNotFoundError: Its metric has not been made.
     """
-    if task.metric is None and task.room is None:
+    made = shipped_file(task, "metric.json").is_file()
+    if task.metric is None and task.room is None and not made:
         return Planning(task, planner_of(task))
     return Expert(task)
 

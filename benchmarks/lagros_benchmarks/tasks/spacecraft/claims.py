@@ -23,7 +23,7 @@ def position_margin(policy: Any, disturbance_bound: float) -> float | None:
     """Return the certified bound of the position error to x_d, of a policy that tracks a plan [m].
 
     Args:
-        policy: The policy as it flies, with whatever it wears. None is returned for all but the
+        policy: The policy as it flies, with whatever it uses. None is returned for all but the
             centralised policy itself: a safety filter, a class derived from it or thrusters that
             saturate apply another control than the one that the bound is for.
         disturbance_bound: d_bar, in units of the state per second.

@@ -105,7 +105,7 @@ class SpacecraftGame(SingleGame):
         return None
 
     def _built(self) -> tuple[Any, Any]:
-        """Return the policy, and again as it flies, with the filter that it may wear."""
+        """Return the policy, and again as it flies, with the filter that it may use."""
         settings, name = self._settings, f"policy {self._settings.policy!r}"
         policy: Any = library.make_single_policy(settings.policy, self.env)
         if not settings.safety_filter:
