@@ -210,7 +210,7 @@ def bench(
             backend=Backend(backend, address),
         )
         for name in settings.policies:
-            check_policy(name, task)
+            check_policy(name, described.name)
         files = policy_files(settings.policies)
         outputs.check(described, settings.episodes, files, {"--out": out}, BENCH_FOLDER)
     except ValueError as error:
