@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol, Self, get_args
 
 import numpy as np
@@ -218,7 +219,7 @@ class Metric:
         named = ", ".join(f"x[{index}]={place[index]:.4g}" for index in self.coordinates)
         return f" at {named} of the region"
 
-    @property
+    @cached_property
     def phi(self) -> Basis:
         """The functions phi_i."""
         return self.basis or default_basis(self.region, len(self.coefficients) - 1)
