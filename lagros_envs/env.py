@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from lagros_envs import of_task
 from lagros_envs.conventions import (
     RENDER_MODES,
     Conforming,
@@ -25,20 +26,7 @@ from lagros_envs.disturbances import Situation
 from lagros_envs.draw import Frame
 from lagros_envs.dynamics.held import HeldStep, OnFloats
 from lagros_envs.numbers import functions
-from lagros_envs.of_task import (
-    Channels,
-    OfTask,
-    action_space,
-    applied,
-    contacts,
-    disturbance_of,
-    meaning_of,
-    named_space,
-    option_names,
-    scenario_with,
-    stated_nominal,
-    stated_scenario,
-)
+from lagros_envs.of_task import Channels, OfTask
 from lagros_envs.options import checked_actions, known_options
 from lagros_envs.rules import StepRules
 from lagros_envs.seeding import SharedStreams, episode_streams
@@ -49,24 +37,6 @@ FloatArray = NDArray[np.float64]
 
 _NOT_YET = End.NOT_YET  # a member of an Enum is looked up slowly
 _READY = 64  # starts that are drawn in advance
-
-
-class _Start(NamedTuple):
-    """How an episode begins.
-
-    Attributes:
-        state: x(0).
-        goal: x_f.
-        discs: Centre and radius of each, shape (most_discs, 3).
-        fixed: What the rules of a step are given of the episode: the discs, then the goal.
-        blank: The observation but for state and time, not to be written to.
-    """
-
-    state: tuple[float, ...]
-    goal: tuple[float, ...]
-    discs: FloatArray
-    fixed: tuple[float, ...]
-    blank: NDArray[np.float32]
 
 
 class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -146,7 +116,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
         """Build the environment; see the class for the arguments."""
         self.render_mode = check_render_mode(render_mode)
         self.settings = self._settings(task, settings)
-        self.disturbance = disturbance_of(
+        self.disturbance = of_task.disturbance_of(
             self.settings, disturbance, disturbance_bound, disturbance_channels, metric
         )
         self._feedback = self.disturbance.is_feedback
@@ -170,21 +140,23 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
         self._shared: SharedStreams | None = None
         # Starts that are drawn in advance, the next one last: to draw many takes little longer than
         # to draw one.
-        self._ready: list[_Start] = []
-        self._layout, self._options = self.settings.layout, option_names(self.settings)
+        self._ready: list[of_task.Start] = []
+        self._layout, self._options = self.settings.layout, of_task.option_names(self.settings)
         self._time_at = self._layout.time
-        self.named_space = named_space(self.settings)
+        self.named_space = of_task.named_space(self.settings)
         self.observation_space = cast(
             "spaces.Space[NDArray[np.float32]]", spaces.flatten_space(self.named_space)
         )
-        self.action_space = cast("spaces.Space[NDArray[np.float32]]", action_space(self.settings))
+        self.action_space = cast(
+            "spaces.Space[NDArray[np.float32]]", of_task.action_space(self.settings)
+        )
         # Where an outcome has reward and fall, and what says that it is one.
         names = self._rules.names
         self._end_at = slice(names.index("reward"), names.index("inside"))
         self._size = names.index("size" if "size" in names else "distance")
         self._n, self._shape = self.settings.system.state_dim, self.action_space.shape
         m = self.settings.system.control_dim
-        self._apply = OnFloats(partial(applied, self.settings), a=m)
+        self._apply = OnFloats(partial(of_task.applied, self.settings), a=m)
         self._begin = OnFloats(self._rules.begun, x=self._n, g=self._rules.given)
         self._renderer: Any = None
         self._started = False
@@ -210,8 +182,8 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
             ValueError: The seed is none, or an option is unknown or has a wrong shape or value.
         """
         options = known_options(options, self._options)
-        given = stated_scenario(options, self.settings) if options else {}
-        nominal = stated_nominal(options, self.settings) if options else None
+        given = of_task.stated_scenario(options, self.settings) if options else {}
+        nominal = of_task.stated_nominal(options, self.settings) if options else None
         if self.disturbance.kind == "worst" and nominal is None:
             n = self.settings.system.state_dim
             raise ValueError(
@@ -222,7 +194,9 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
         super().reset(seed=seed)
         start = self._draw(seed)
         if given:
-            start = self._starts(scenario_with(_scenario(start), given))[0]
+            start = of_task.starts_of(
+                self.settings, of_task.scenario_with(of_task.scenario_of(start), given)
+            )[0]
         self._start, self.nominal = start, nominal
         self._state, self._goal, _, self._fixed, self._blank = start
         self._step = 0
@@ -274,7 +248,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
     def scenario(self) -> Scenario:
         """The scenario of the episode."""
         check_started(self._started, "scenario")
-        found = _scenario(self._start)
+        found = of_task.scenario_of(self._start)
         return Scenario(found.initial_state, found.goal, found.discs[found.discs[:, 2] > 0.0])
 
     @property
@@ -292,10 +266,8 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene: an RGB array, or a window in the mode "human"."""
         if self.render_mode is None:
-            gym.logger.warn(
-                "render() was called without a render mode; "
-                'pass render_mode="rgb_array" to gym.make'
-            )
+            said = 'render() was called without a render mode; pass render_mode="rgb_array"'
+            gym.logger.warn(f"{said} to gym.make")
             return None
         check_started(self._started, "render()")
         if self._renderer is None:
@@ -322,7 +294,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
             self._renderer.close()
             self._renderer = None
 
-    def _draw(self, seed: int | None) -> _Start:
+    def _draw(self, seed: int | None) -> of_task.Start:
         """Draw the disturbance of an episode and return its start."""
         disturbed = not self._calm
         if seed is not None:
@@ -331,7 +303,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
                 self._pushes = self.disturbance.realise(
                     streams.disturbance, self._steps, self.settings.control_period
                 )
-            return self._starts(self.settings.sample(streams.scenario))[0]
+            return of_task.starts_of(self.settings, self.settings.sample(streams.scenario))[0]
         if self._shared is None or self._shared.source is not self.np_random:
             self._shared, self._ready = SharedStreams(self.np_random), []
         if disturbed:
@@ -340,22 +312,8 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
             self._stepwise.begin(np.zeros(1, np.intp), self._shared.disturbance)
         if not self._ready:
             drawn = self.settings.sample_many(self._shared.scenario, _READY)
-            self._ready = self._starts(drawn)[::-1]
+            self._ready = of_task.starts_of(self.settings, drawn)[::-1]
         return self._ready.pop()
-
-    def _starts(self, scenarios: Scenario) -> list[_Start]:
-        """Return the starts of one scenario or of several."""
-        states, goals = np.atleast_2d(scenarios.initial_state, scenarios.goal)
-        blanks = np.zeros((len(states), self._layout.size), np.float32)
-        blanks[:, self._layout.goal], blanks[:, self._layout.initial_state] = goals, states
-        first, second = list(map(tuple, states.tolist())), list(map(tuple, goals.tolist()))
-        last, discs = second, np.zeros((len(first), 0, 3))
-        if self._discs:
-            discs = self.settings.all_discs(scenarios.discs).reshape(len(states), -1, 3)
-            blanks[:, self._layout.discs] = discs.reshape(len(states), -1)
-            fixed = np.concatenate([contacts(self.settings, discs), goals], axis=1)
-            last = list(map(tuple, fixed.tolist()))
-        return list(map(_Start, first, second, discs, last, blanks))
 
     def _control(self, action: NDArray[np.float32]) -> tuple[float, ...]:
         if type(action) is np.ndarray and action.shape == self._shape and action.dtype.char in "fd":
@@ -365,7 +323,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
         if not math.isfinite(sum(values)):
             # Slower, and with a message.
             shape = (self.settings.system.control_dim,)
-            values = checked_actions(action, shape, meaning_of(self.settings)).tolist()
+            values = checked_actions(action, shape, of_task.meaning_of(self.settings)).tolist()
         control, _ = self._apply.run(values)
         return control
 
@@ -450,7 +408,3 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
             nominal = self.nominal[self._nominal_index()].tolist()
             info["tracking_error"] = distance_between(self._state, nominal, functions)
         return info
-
-
-def _scenario(start: _Start) -> Scenario:
-    return Scenario(np.array(start.state), np.array(start.goal), start.discs)

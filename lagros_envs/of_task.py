@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -22,6 +22,24 @@ from lagros_envs.task import LARGEST_CONTROL, Numbers, Scenario, Task
 
 FloatArray = NDArray[np.float64]
 Channels = Literal["all", "rates"] | Sequence[bool]
+
+
+class Start(NamedTuple):
+    """How an episode begins.
+
+    Attributes:
+        state: x(0).
+        goal: x_f.
+        discs: Centre and radius of each, shape (most_discs, 3).
+        fixed: What the rules of a step are given of the episode: the discs, then the goal.
+        blank: The observation but for state and time, not to be written to.
+    """
+
+    state: tuple[float, ...]
+    goal: tuple[float, ...]
+    discs: FloatArray
+    fixed: tuple[float, ...]
+    blank: NDArray[np.float32]
 
 
 class OfTask:
@@ -209,3 +227,24 @@ def scenario_with(drawn: Scenario, stated: dict[str, FloatArray]) -> Scenario:
     """Return a scenario with the parts that were stated in place of those that were drawn."""
     parts = {"initial_state": drawn.initial_state, "goal": drawn.goal, "discs": drawn.discs}
     return Scenario(**{**parts, **stated})
+
+
+def starts_of(task: Task, scenarios: Scenario) -> list[Start]:
+    """Return the starts of one scenario or of several."""
+    layout = task.layout
+    states, goals = np.atleast_2d(scenarios.initial_state, scenarios.goal)
+    blanks = np.zeros((len(states), layout.size), np.float32)
+    blanks[:, layout.goal], blanks[:, layout.initial_state] = goals, states
+    first, second = list(map(tuple, states.tolist())), list(map(tuple, goals.tolist()))
+    last, discs = second, np.zeros((len(first), 0, 3))
+    if task.most_discs:
+        discs = task.all_discs(scenarios.discs).reshape(len(states), -1, 3)
+        blanks[:, layout.discs] = discs.reshape(len(states), -1)
+        fixed = np.concatenate([contacts(task, discs), goals], axis=1)
+        last = list(map(tuple, fixed.tolist()))
+    return list(map(Start, first, second, discs, last, blanks))
+
+
+def scenario_of(start: Start) -> Scenario:
+    """Return the scenario of an episode that begins so."""
+    return Scenario(np.array(start.state), np.array(start.goal), start.discs)

@@ -200,3 +200,37 @@ class StepRules:
             inside,
             size,
         )
+
+
+class Rows:
+    """Rows of what is kept of every world, so that a restart writes all of it at once.
+
+    Coordinates come first: that is what the equation of motion works on. The rules of a step read
+    `given`, as `Given`, and renew `outcome`, as far as they keep of `Outcome`.
+
+    Args:
+        rules: The rules of a step of the task.
+    """
+
+    def __init__(self, rules: StepRules) -> None:
+        """Lay out the rows."""
+        n, names = rules.task.system.state_dim, rules.names
+        self.state = slice(0, n)
+        self.start = slice(n, n + min(rules.head, 2))
+        self.discs = slice(self.start.stop, n + rules.head)
+        self.goal = slice(n + rules.head, 2 * n + rules.head)
+        self.now, self.radius = self.goal.stop, self.goal.stop + 1
+        begin = self.radius + 1
+        self.given = slice(n, n + rules.given)
+        self.outcome = slice(begin, begin + len(names))
+        self.count = self.outcome.stop
+        places = {name: begin + place for place, name in enumerate(names)}
+        # None where there are no discs.
+        self.collided = places.get("collided")
+        self.success_time, self.distance = places["success_time"], places["distance"]
+        self.reward, self.fallen, self.inside = (
+            places[name] for name in ("reward", "fallen", "inside")
+        )
+        # Of the info: from effort to distance, which lie side by side.
+        self.effort = places["effort"]
+        self.size = places.get("size", self.distance)

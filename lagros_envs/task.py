@@ -40,13 +40,26 @@ from lagros_envs.checks import (
 )
 from lagros_envs.dynamics.system import System
 from lagros_envs.numbers.functions import where
+from lagros_envs.task_parts import Defaults, Feedback, Learning, MetricDesign, Numbers
 from lagros_envs.values import ByValue, use_plain_numbers
 
 if TYPE_CHECKING:
     from lagros_envs.draw import Renderer
 
+__all__ = [
+    "Defaults",
+    "Described",
+    "Feedback",
+    "Layout",
+    "Learning",
+    "MetricDesign",
+    "Numbers",
+    "Scenario",
+    "Task",
+    "distance_between",
+]
+
 FloatArray = NDArray[np.float64]
-Numbers = tuple[float, ...]
 
 # Farther from its goal than this the integration has diverged under an enormous control.
 LARGEST_DISTANCE = 1e12
@@ -110,117 +123,6 @@ class Layout:
         """Return the discs in observations (..., size), shape (..., most discs, 3)."""
         rows = np.asarray(observation[..., self.discs], np.float64)
         return rows.reshape(*rows.shape[:-1], -1, 3)
-
-
-@dataclass(frozen=True)
-class MetricDesign:
-    """Which contraction metric a task wants, and where it has to hold (CV-STEM, Theorem 2).
-
-    W is a sum of coefficients times `basis`, functions of x or of x_d written as in
-    `lagros_policies.contraction.Basis`, such as "1", "cos(x[2])" or "x[3]**2".
-
-    Attributes:
-        low: Least x_d of the region, shape (n,).
-        high: Largest x_d, shape (n,).
-        error: Largest |x - x_d| of each coordinate, shape (n,).
-        control_low: Least u_d, shape (m,).
-        control_high: Largest u_d, shape (m,).
-        basis: Functions of the point.
-        point: "state": the metric is a function of x; "nominal": of x_d, for systems whose control
-            moves all that the motion depends on.
-        rate: Contraction rate alpha [1/s].
-        scaling: Of the coordinates in the condition number, shape (n,); None for ones.
-        margin: By how much the condition is asked for beyond zero [1/s].
-    """
-
-    low: Numbers
-    high: Numbers
-    error: Numbers
-    control_low: Numbers
-    control_high: Numbers
-    basis: tuple[str, ...] = ("1",)
-    point: str = "state"
-    rate: float = 0.5
-    scaling: Numbers | None = None
-    margin: float = 0.1
-
-
-@dataclass(frozen=True)
-class Feedback:
-    """What u* prefers where contraction leaves a choice: a regulator along the plan.
-
-    Attributes:
-        state_weights: Diagonal of Q, shape (n,).
-        control_weights: Diagonal of R, shape (m,).
-    """
-
-    state_weights: Numbers
-    control_weights: Numbers
-
-
-@dataclass(frozen=True)
-class Learning:
-    """How the networks of a task are made (Algorithm 1, then DAgger).
-
-    Attributes:
-        plans: Random episodes with a target trajectory each.
-        samples: Labelled states around them.
-        disturbance_bound: Largest d_bar of the flights that fill the tube.
-        hidden: Width of each hidden layer of (c) and (a); where there are discs, the first two are
-            for each of them.
-        epochs: Passes over the data for (c).
-        learned_epochs: Likewise for (a).
-        batch: Samples per step.
-        rounds: Rounds of DAgger: the network flies, u* says what it should have done.
-        round_plans: Episodes of each round.
-        round_samples: Labelled states of each round.
-        round_epochs: Passes over the data before each round.
-    """
-
-    plans: int = 1000
-    samples: int = 50_000
-    disturbance_bound: float = 1.0
-    hidden: tuple[int, ...] = (100, 100, 100)
-    epochs: int = 600
-    learned_epochs: int = 150
-    batch: int = 512
-    rounds: int = 0
-    round_plans: int = 1000
-    round_samples: int = 50_000
-    round_epochs: int = 20
-
-
-@dataclass(frozen=True)
-class Defaults:
-    """What the commands take where the user says nothing; each stands here and nowhere else.
-
-    Attributes:
-        policies: Of `lagros bench`.
-        bounds: d_bar of `lagros bench`, in units of the state per second.
-        bound: d_bar of the commands that take one.
-        episodes: Episodes of `lagros bench`.
-        agents: Agents of each of its worlds; () for a task of one body, as in the next two.
-        preset: Of `Described.presets`.
-        safety_filter: "none", "all" policies use it, or "both" one after the other.
-        attack_episodes: Episodes that `lagros attack` searches.
-        attack_budget: Flights that it may spend on each.
-        certify_policies: What `lagros certify` may be asked about, the first by default.
-        certify_episodes: Flights behind a calibrated bound.
-        speed: Of the film of `lagros watch`, as a multiple of the real one.
-    """
-
-    policies: tuple[str, ...] = ("learned", "tube-mpc", "lagros", "lqr")
-    bounds: Numbers = (0.75,)
-    bound: float = 0.75
-    episodes: int = 50
-    agents: tuple[int, ...] = ()
-    preset: str | None = None
-    safety_filter: str = "none"
-    attack_episodes: int = 10
-    attack_budget: int = 1000
-    certify_policies: tuple[str, ...] = ("lagros", "tube-mpc")
-    certify_episodes: int = 400
-    speed: float = 1.0
 
 
 class Described:

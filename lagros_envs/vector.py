@@ -10,28 +10,16 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from lagros_envs import of_task
 from lagros_envs.autoreset import RestartingVectorEnv, nominal_after
 from lagros_envs.checks import check_whole
 from lagros_envs.conventions import check_started
 from lagros_envs.disturbances import Situation
 from lagros_envs.dynamics.held import HeldBatch
 from lagros_envs.numbers import functions
-from lagros_envs.of_task import (
-    Channels,
-    OfTask,
-    action_space,
-    actuators,
-    contacts,
-    disturbance_of,
-    meaning_of,
-    named_space,
-    option_names,
-    scenario_with,
-    stated_nominal,
-    stated_scenario,
-)
+from lagros_envs.of_task import Channels, OfTask
 from lagros_envs.options import checked_actions
-from lagros_envs.rules import StepRules
+from lagros_envs.rules import Rows, StepRules
 from lagros_envs.seeding import seeded_streams
 from lagros_envs.stepwise import StepwiseDisturbance
 from lagros_envs.task import LARGEST_DISTANCE, Scenario, Task, distance_between
@@ -42,40 +30,6 @@ IntArray = NDArray[np.intp]
 
 # Starts that are drawn in advance.
 _READY = 2048
-
-
-class _Rows:
-    """Rows of what is kept of every world, so that a restart writes all of it at once.
-
-    Coordinates come first: that is what the equation of motion works on. The rules of a step read
-    `given`, as `rules.Given`, and renew `outcome`, as far as they keep of `rules.Outcome`.
-
-    Args:
-        rules: The rules of a step of the task.
-    """
-
-    def __init__(self, rules: StepRules) -> None:
-        """Lay out the rows."""
-        n, names = rules.task.system.state_dim, rules.names
-        self.state = slice(0, n)
-        self.start = slice(n, n + min(rules.head, 2))
-        self.discs = slice(self.start.stop, n + rules.head)
-        self.goal = slice(n + rules.head, 2 * n + rules.head)
-        self.now, self.radius = self.goal.stop, self.goal.stop + 1
-        begin = self.radius + 1
-        self.given = slice(n, n + rules.given)
-        self.outcome = slice(begin, begin + len(names))
-        self.count = self.outcome.stop
-        places = {name: begin + place for place, name in enumerate(names)}
-        # None where there are no discs.
-        self.collided = places.get("collided")
-        self.success_time, self.distance = places["success_time"], places["distance"]
-        self.reward, self.fallen, self.inside = (
-            places[name] for name in ("reward", "fallen", "inside")
-        )
-        # Of the info: from effort to distance, which lie side by side.
-        self.effort = places["effort"]
-        self.size = places.get("size", self.distance)
 
 
 class _Starts(NamedTuple):
@@ -140,14 +94,14 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
         """Build the worlds; see the class for the arguments."""
         check_whole("num_envs", num_envs)
         self.settings = self._settings(task, settings)
-        self.option_names = ("reset_mask", *option_names(self.settings))
-        self.named_space = named_space(self.settings)
+        self.option_names = ("reset_mask", *of_task.option_names(self.settings))
+        self.named_space = of_task.named_space(self.settings)
         super().__init__(
             num_envs,
             num_envs,
             spaces.flatten_space(self.named_space),
-            action_space(self.settings),
-            disturbance_of(
+            of_task.action_space(self.settings),
+            of_task.disturbance_of(
                 self.settings, disturbance, disturbance_bound, disturbance_channels, metric
             ),
             self.settings,
@@ -172,8 +126,8 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
     def _allocate(self) -> None:
         worlds, self._steps = self.num_envs, self.settings.steps
         self._dim, self._layout = self.settings.system.state_dim, self.settings.layout
-        self._rows = _Rows(self._rules)
-        self._actuators = list(zip(*actuators(self.settings), strict=True))
+        self._rows = Rows(self._rules)
+        self._actuators = list(zip(*of_task.actuators(self.settings), strict=True))
         self._kept = np.zeros((self._rows.count, worlds))
         self._step = np.zeros(worlds, np.intp)
         self._push = np.zeros((self._dim, worlds))
@@ -236,14 +190,14 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
         return self._kept[self._rows.goal]
 
     def _checked(self, mask: BoolArray, options: dict[str, Any]) -> dict[str, Any]:
-        nominal = stated_nominal(options, self.settings, (self.num_envs,), mask)
+        nominal = of_task.stated_nominal(options, self.settings, (self.num_envs,), mask)
         if self.disturbance.kind == "worst" and nominal is None:
             raise ValueError(
                 'disturbance="worst" needs the nominal trajectories: pass '
                 'reset(options={"nominal": array of shape '
                 f"(num_envs, steps + 1, {self._dim})}})"
             )
-        scenario = stated_scenario(options, self.settings, (self.num_envs,), mask)
+        scenario = of_task.stated_scenario(options, self.settings, (self.num_envs,), mask)
         return {"nominal": nominal, "scenario": scenario}
 
     def _set_nominal(self, mask: BoolArray, given: dict[str, Any]) -> None:
@@ -291,7 +245,7 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
     def _starts(self, drawn: Scenario, stated: dict[str, FloatArray]) -> _Starts:
         """Return what is kept of episodes at their start."""
         task, rows, layout = self.settings, self._rows, self._layout
-        scenario = scenario_with(drawn, stated)
+        scenario = of_task.scenario_with(drawn, stated)
         count = len(scenario.initial_state)
         kept = np.zeros((rows.count, count))
         state = kept[rows.state]
@@ -299,7 +253,7 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
         kept[rows.radius], kept[rows.success_time] = self._radii[0], np.inf
         if rows.collided is not None:
             kept[rows.start] = state[list(task.position)]
-            kept[rows.discs] = contacts(task, scenario.discs).T
+            kept[rows.discs] = of_task.contacts(task, scenario.discs).T
         kept[rows.outcome] = np.broadcast_arrays(*self._rules.begun([*state], [*kept[rows.given]]))
         blank = np.zeros((count, layout.size), np.float32)
         blank[:, layout.goal], blank[:, layout.initial_state] = (
@@ -375,7 +329,9 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
         if usual and np.count_nonzero(np.isfinite(actions)) == actions.size:
             # What single precision holds does not overflow on its way to a control.
             return self._applied(actions.astype(np.float64))
-        checked = checked_actions(actions, shape, f"{meaning_of(self.settings)} of each world")
+        checked = checked_actions(
+            actions, shape, f"{of_task.meaning_of(self.settings)} of each world"
+        )
         with np.errstate(over="ignore"):
             return self._applied(checked)
 
@@ -421,7 +377,7 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
         collided = None if rows.collided is None else kept[1] > 0.0
         if collided is not None:
             success &= ~collided
-        calm = self.disturbance.kind == "none"
+        calm, shape = self.disturbance.kind == "none", self._push.T.shape
         info = {
             "success": success,
             "is_success": success.copy(),
@@ -430,9 +386,7 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
             "fallen": fallen,
             "effort": effort,
             "effort_to_success": effort_to_success,
-            "disturbance": np.zeros(self._push.T.shape)
-            if calm
-            else np.array(self._push.T, order="C"),
+            "disturbance": np.zeros(shape) if calm else np.array(self._push.T, order="C"),
             "tube_radius": radius,
             "goal_distance": distance,
         }

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.seeding import episode_seeds, episode_streams
+from lagros_envs.task import Scenario
 from lagros_envs.tasks.cartpole import task
 from lagros_policies.planning import Trajectory
 from lagros_policies.tasks.cartpole.planner import CartPolePlanner, CartPolePlannerSettings
@@ -42,7 +43,7 @@ class Bench:
 
     scale: Scale
     planner: CartPolePlanner
-    scenarios: list[task.CartPoleScenario]
+    scenarios: list[Scenario]
     plans: list[Trajectory]
     perturbed: FloatArray
     _peers: dict[tuple[int, bool], dict[str, CasadiPlanner]] = field(default_factory=dict)
@@ -102,9 +103,9 @@ class Bench:
         }
 
 
-def draw(settings: task.CartPoleSettings, count: int) -> list[task.CartPoleScenario]:
+def draw(settings: task.CartPoleSettings, count: int) -> list[Scenario]:
     """Return random episodes; more of them begin with the fewer."""
     return [
-        task.sample_scenario(episode_streams(seed).scenario, settings)
+        settings.sample(episode_streams(seed).scenario)
         for seed in episode_seeds(_SEED, count, _EPISODES)
     ]

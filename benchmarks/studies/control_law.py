@@ -60,7 +60,7 @@ def episodes(expert: CartPoleExpert, count: int) -> tuple[TrackedPlans, FloatArr
     plans, pushes = [], []
     for seed in episode_seeds(0, count, _NAMESPACE):
         streams = episode_streams(seed)
-        scenario = task.sample_scenario(streams.scenario, settings)
+        scenario = settings.sample(streams.scenario)
         plan = expert.planner.plan(scenario.initial_state, scenario.goal)
         if not plan.solved:
             raise RuntimeError(f"episode {seed} has no plan: {plan.status}")

@@ -71,7 +71,7 @@ def plan_episodes(expert: CartPoleExpert, count: int, namespace: int, seed: int 
     plans, goals, pushes = [], [], []
     for number in episode_seeds(seed, count, namespace):
         streams = episode_streams(number)
-        scenario = task.sample_scenario(streams.scenario, settings)
+        scenario = settings.sample(streams.scenario)
         plan = expert.planner.plan(scenario.initial_state, scenario.goal)
         if not plan.solved:
             raise RuntimeError(f"episode {number} has no plan: {plan.status}")

@@ -55,7 +55,7 @@ def settled_plans(count: int) -> Plans:
     planner = CartPolePlanner(settings)
     starts, controls = [], []
     for seed in episode_seeds(0, count, NAMESPACE):
-        scenario = task.sample_scenario(episode_streams(seed).scenario, settings)
+        scenario = settings.sample(episode_streams(seed).scenario)
         plan = planner.plan(scenario.initial_state, scenario.goal)
         part = plan.states[_SETTLED_STEP : _SETTLED_STEP + _STEPS + 1]
         force = plan.controls[_SETTLED_STEP : _SETTLED_STEP + _STEPS]

@@ -84,7 +84,7 @@ def plan_episodes(
     """Plan random episodes: x_d, shape (count, N + 1, 4), and u_d, (count, N, 1)."""
     plans = []
     for one in episode_seeds(seed, count, namespace):
-        scenario = task.sample_scenario(episode_streams(one).scenario, expert.task)
+        scenario = expert.task.sample(episode_streams(one).scenario)
         plan = expert.planner.plan(scenario.initial_state, scenario.goal)
         if not plan.solved:
             raise RuntimeError(f"episode {one} has no plan: {plan.status}")

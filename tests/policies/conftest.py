@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lagros_envs.tasks.cartpole import task
 from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_policies.contraction import CvStemSettings, Samples, design_on_pool
 from lagros_policies.learning.networks import Mlp
@@ -112,7 +111,7 @@ def fresh_plans(count, seed):
     plans = []
     for index in range(count):
         rng = np.random.default_rng([seed, index])
-        scenario = task.sample_scenario(rng, planner.task)
+        scenario = planner.task.sample(rng)
         plans.append(planner.plan(scenario.initial_state, scenario.goal))
     assert all(plan.solved for plan in plans)
     return np.stack([plan.states for plan in plans]), np.stack([plan.controls for plan in plans])

@@ -42,7 +42,7 @@ def plans():
     """Return x_d (8, 91, 4) and u_d (8, 90, 1) of random episodes that do not lean far."""
     planner, found = CartPolePlanner(task.CartPoleSettings(initial_angle=0.6)), []
     for seed in episode_seeds(3, 8, 991):
-        scenario = task.sample_scenario(episode_streams(seed).scenario, planner.task)
+        scenario = planner.task.sample(episode_streams(seed).scenario)
         found.append(planner.plan(scenario.initial_state, scenario.goal))
     assert all(plan.solved for plan in found)
     return np.stack([p.states for p in found]), np.stack([p.controls for p in found])

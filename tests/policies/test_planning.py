@@ -5,7 +5,6 @@ import pytest
 import scipy.integrate
 import scipy.optimize
 
-from lagros_envs.tasks.cartpole import task
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.planning import ScpSettings
 from lagros_policies.tasks.cartpole.planner import CartPolePlanner, CartPolePlannerSettings
@@ -24,7 +23,7 @@ def goal_at(position):
 def random_scenarios(count, seed, settings=None):
     for index in range(count):
         rng = np.random.default_rng([seed, index])
-        yield task.sample_scenario(rng, settings or CartPoleSettings())
+        yield (settings or CartPoleSettings()).sample(rng)
 
 
 def angle_limit(settings, times):

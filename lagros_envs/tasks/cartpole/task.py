@@ -19,7 +19,7 @@ from lagros_envs.checks import (
     check_positive,
 )
 from lagros_envs.draw import Renderer
-from lagros_envs.task import LARGEST_CONTROL, LARGEST_DISTANCE, Layout, Learning, Scenario, Task
+from lagros_envs.task import LARGEST_CONTROL, Layout, Learning, Scenario, Task
 from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tube import PaperTube
 from lagros_envs.values import use_plain_numbers
@@ -165,26 +165,3 @@ class CartPoleSettings(Task):
         initial_state[:, 1] = self.initial_angle * shares[:, 0]
         goal[:, 0] = self.goal_range * shares[:, 1]
         return Scenario(initial_state, goal, np.zeros((len(shares), 0, 3)))
-
-
-# Until their callers take the task's own.
-__all__ = ["LARGEST_DISTANCE"]
-CartPoleScenario = Scenario
-
-
-def sample_scenario(rng: np.random.Generator, settings: CartPoleSettings) -> Scenario:
-    """Draw x(0) = [0, theta_0, 0, 0] and x_f = [p_f, 0, 0, 0]."""
-    return settings.sample(rng)
-
-
-def applied_force(settings: CartPoleSettings, action: Any, clip: Any) -> Any:
-    """Return the force of an action [N] (floats or arrays): scaled, then clipped to the limit."""
-    limit = LARGEST_CONTROL if settings.force_limit is None else settings.force_limit
-    return clip(settings.force_scale * action, -limit, limit)
-
-
-def goal_distance(state: Any, goal: Any, sqrt: Any) -> Any:
-    """Return ||x - x_f|| from the components of both (floats or arrays)."""
-    (p, angle, velocity, rate), (p_f, angle_f, velocity_f, rate_f) = state, goal
-    p, angle, velocity, rate = p - p_f, angle - angle_f, velocity - velocity_f, rate - rate_f
-    return sqrt(p * p + angle * angle + velocity * velocity + rate * rate)

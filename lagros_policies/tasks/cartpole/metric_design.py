@@ -111,7 +111,7 @@ def tube_samples(
     planner = CartPolePlanner(task_settings)
     states, controls = [], []
     for seed in episode_seeds(settings.seed, settings.plans, namespace):
-        scenario = task.sample_scenario(episode_streams(seed).scenario, task_settings)
+        scenario = task_settings.sample(episode_streams(seed).scenario)
         plan = planner.plan(scenario.initial_state, scenario.goal)
         if plan.solved:
             states.append(plan.states[:-1])
