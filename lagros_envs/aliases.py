@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
@@ -26,8 +26,11 @@ def install(moved: Mapping[str, str]) -> None:
     sys.meta_path.insert(0, Moved(moved))
 
 
-def moved_names(module: str) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a module that names in the table of its package have left."""
+def moved_names(module: str) -> None:
+    """Let a module find names that have left it, by the table of its package.
+
+    It is not assigned there as `__getattr__`: type checkers would take every name for known.
+    """
 
     def find(name: str) -> Any:
         table = importlib.import_module(f"{module.partition('.')[0]}.tasks.moved")
@@ -39,7 +42,7 @@ def moved_names(module: str) -> Callable[[str], Any]:
         _warn(f"{module}.{name}", f"{home}.{name}")
         return value
 
-    return find
+    vars(sys.modules[module])["__getattr__"] = find
 
 
 class Moved(MetaPathFinder):

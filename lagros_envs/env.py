@@ -144,12 +144,9 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
         self._layout, self._options = self.settings.layout, of_task.option_names(self.settings)
         self._time_at = self._layout.time
         self.named_space = of_task.named_space(self.settings)
-        self.observation_space = cast(
-            "spaces.Space[NDArray[np.float32]]", spaces.flatten_space(self.named_space)
-        )
-        self.action_space = cast(
-            "spaces.Space[NDArray[np.float32]]", of_task.action_space(self.settings)
-        )
+        flat: Any = spaces.flatten_space(self.named_space)
+        box: Any = of_task.action_space(self.settings)
+        self.observation_space, self.action_space = flat, box
         # Where an outcome has reward and fall, and what says that it is one.
         names = self._rules.names
         self._end_at = slice(names.index("reward"), names.index("inside"))
@@ -194,9 +191,8 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
         super().reset(seed=seed)
         start = self._draw(seed)
         if given:
-            start = of_task.starts_of(
-                self.settings, of_task.scenario_with(of_task.scenario_of(start), given)
-            )[0]
+            scenario = of_task.scenario_with(of_task.scenario_of(start), given)
+            start = of_task.starts_of(self.settings, scenario)[0]
         self._start, self.nominal = start, nominal
         self._state, self._goal, _, self._fixed, self._blank = start
         self._step = 0

@@ -24,7 +24,7 @@ from lagros_policies.room import found_file, part_of, shipped_file
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-__getattr__ = moved_names(__name__)
+moved_names(__name__)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from lagros_envs.aliases import moved_names
 from lagros_policies.learning.network_policy import NetworkPolicy
 
-__getattr__ = moved_names(__name__)
+moved_names(__name__)
 
 
 class LearnedPolicy(NetworkPolicy):

@@ -40,7 +40,7 @@ _SINGLE = {
     "residual": "lagros_policies.residual:ResidualPolicy",
 }
 NAMES = tuple(_SINGLE)
-__getattr__ = moved_names(__name__)
+moved_names(__name__)
 
 
 @runtime_checkable

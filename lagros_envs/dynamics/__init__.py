@@ -18,7 +18,7 @@ from lagros_envs.dynamics.system import (
     vector_field,
 )
 
-__getattr__ = moved_names(__name__)
+moved_names(__name__)
 __all__ = [
     "Components",
     "Functions",

@@ -64,4 +64,4 @@ __all__ = [
     "verify_metric",
 ]
 
-__getattr__ = moved_names(__name__)
+moved_names(__name__)

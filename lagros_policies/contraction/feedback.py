@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lagros_envs.aliases import moved_names
 
-__getattr__ = moved_names(__name__)
+moved_names(__name__)
 FloatArray = NDArray[np.float64]
 
 # The terminal weight, in units of the last stage weight.

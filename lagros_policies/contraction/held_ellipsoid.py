@@ -17,7 +17,7 @@ from lagros_policies.proof.families import BoxCondition, Violation, lifted_matri
 from lagros_policies.proof.matrices import matmul, negative_definite, transpose
 from lagros_policies.proof.sets import triples
 
-__getattr__ = moved_names(__name__)
+moved_names(__name__)
 FloatArray = NDArray[np.float64]
 
 # The shortest hold that is covered, as a share of the longest, where shorter ones are.

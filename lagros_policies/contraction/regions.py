@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lagros_envs.aliases import moved_names
 from lagros_envs.checks import check_fields, check_positive, check_whole, is_number, shown
 
-__getattr__ = moved_names(__name__)
+moved_names(__name__)
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Numbers = tuple[float, ...]

@@ -32,7 +32,7 @@ from lagros_policies.contraction.condition import Samples
 from lagros_policies.contraction.control import contraction_terms
 from lagros_policies.contraction.metric import Metric, metric_place
 
-__getattr__ = moved_names(__name__)
+moved_names(__name__)
 FloatArray = NDArray[np.float64]
 
 

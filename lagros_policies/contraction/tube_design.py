@@ -35,7 +35,7 @@ from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.regions import BoxRegion
 from lagros_policies.contraction.semidefinite import solve_conic, svec, symmetric_basis
 
-__getattr__ = moved_names(__name__)
+moved_names(__name__)
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Method = Literal["paper", "output", "ellipsoid"]

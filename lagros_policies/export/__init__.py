@@ -6,6 +6,6 @@ Both map what a policy that is a network observes to controls in their own units
 from lagros_envs.aliases import moved_names
 from lagros_policies.export.source import Source, exported_names, load_source
 
-__getattr__ = moved_names(__name__)
+moved_names(__name__)
 
 __all__ = ["Source", "exported_names", "load_source"]

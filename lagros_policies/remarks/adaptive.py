@@ -37,7 +37,7 @@ from lagros_policies.contraction.metric import matrices_along, metric_place
 from lagros_policies.contraction.places import along
 from lagros_policies.contraction.regions import even_coordinate
 
-__getattr__ = moved_names(__name__)
+moved_names(__name__)
 FloatArray = NDArray[np.float64]
 # (x (..., n), u (..., 1)) -> Y (..., k), in units of the control per unit of a.
 Regressor = Callable[[FloatArray, FloatArray], FloatArray]

@@ -30,7 +30,7 @@ from lagros_envs.aliases import moved_names
 from lagros_envs.checks import check_not_negative, check_positive, check_whole
 
 FloatArray = NDArray[np.float64]
-__getattr__ = moved_names(__name__)
+moved_names(__name__)
 
 # What is left of an impulse response after this many steps of the slower mode is nothing.
 _TAIL = 1e-12

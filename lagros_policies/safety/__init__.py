@@ -5,4 +5,4 @@ from lagros_policies.safety.barrier import BarrierSettings, BrakingBarrier, Half
 from lagros_policies.safety.half_planes import nearest
 
 __all__ = ["BarrierSettings", "BrakingBarrier", "HalfPlanes", "nearest"]
-__getattr__ = moved_names(__name__)
+moved_names(__name__)

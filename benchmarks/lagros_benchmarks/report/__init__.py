@@ -2,4 +2,4 @@
 
 from lagros_envs.aliases import moved_names
 
-__getattr__ = moved_names(__name__)
+moved_names(__name__)

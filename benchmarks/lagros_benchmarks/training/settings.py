@@ -301,4 +301,4 @@ class SingleTraining(Training):
         return f"residual-{self.algorithm.name}-{self.largest_correction:g}{unit}"
 
 
-__getattr__ = moved_names(__name__)
+moved_names(__name__)

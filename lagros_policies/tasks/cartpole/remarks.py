@@ -37,7 +37,7 @@ from lagros_policies.tube_mpc import TubeMpcPolicy, TubeMpcState, check_own_metr
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
-__getattr__ = moved_names(__name__)
+moved_names(__name__)
 
 # What the adaptation is prepared for: |dp/dt| [m/s] and |d2p/dt2| [m/s^2] of the cart, and how far
 # its friction [N s/m] and its mass [kg] may be from the model's.
