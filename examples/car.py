@@ -1,7 +1,8 @@
-"""A task of your own in one file: a car among discs.
+"""A task of your own in one file: a car among discs. Needs `pip install 'lagros[bench]'`.
 
-`lagros reproduce examples/car.py` makes its metric and networks, `lagros bench examples/car.py`
-flies them, and after `register_task(CarTask())` there is `gym.make("lagros/Car-v0")`.
+    lagros bench examples/car.py        # after `lagros reproduce examples/car.py`, with its results
+
+After `register_task(CarTask())` there is `gym.make("lagros/Car-v0")`.
 """
 
 import math

@@ -297,7 +297,9 @@ class Task(Described):
         return Scenario(
             np.array([one.initial_state for one in drawn], np.float64).reshape(-1, n),
             np.array([one.goal for one in drawn], np.float64).reshape(-1, n),
-            np.array([self.all_discs(one.discs) for one in drawn]).reshape(-1, self.most_discs, 3),
+            np.array([self.all_discs(one.discs) for one in drawn]).reshape(
+                len(drawn), self.most_discs, 3
+            ),
         )
 
     def all_discs(self, discs: FloatArray) -> FloatArray:
