@@ -20,7 +20,7 @@ TEXT = README.read_text(encoding="utf-8")
 
 def test_every_block_runs(capsys: pytest.CaptureFixture[str]) -> None:
     blocks = documents.python_blocks(TEXT)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     names: dict[str, Any] = {}
     for block in blocks:
         exec(block, names)
@@ -52,6 +52,16 @@ def test_the_readers_own_policy_has_the_success_that_is_said(
     assert row[1] == "100.0"
 
 
+def test_the_readers_own_system_flies(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    first_half.write_modules(TEXT)
+    command = ["bench", "./slide.py", "--policies", "lqr,random", "--episodes", "3"]
+    result = CliRunner().invoke(cli.app, command)
+    assert result.exit_code == 0
+    row = next(line.split() for line in result.output.splitlines() if line.startswith(" lqr"))
+    assert row[1] == "100.0"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "said"), [(1, "6 of 6 arrived, 0 collided"), (0, "2 collided")])
 def test_the_worlds_to_watch_are_what_is_said_of_them(
@@ -66,7 +76,7 @@ def test_the_worlds_to_watch_are_what_is_said_of_them(
 
 def test_the_first_half_needs_no_other_extra_than_that_of_the_command_line() -> None:
     blocks, typed = first_half.blocks_and_commands(TEXT)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     assert {command.words[1] for command in typed} == {
         *("bench", "watch", "attack", "certify", "export")
     }
