@@ -293,13 +293,11 @@ class Task(Described):
             All of them, with a leading axis; discs that are missing are rows of zeros.
         """
         drawn = [self.sample(rng) for rng in generators]
-        n = self.system.state_dim
+        count, n, most = len(drawn), self.system.state_dim, self.most_discs
         return Scenario(
-            np.array([one.initial_state for one in drawn], np.float64).reshape(-1, n),
-            np.array([one.goal for one in drawn], np.float64).reshape(-1, n),
-            np.array([self.all_discs(one.discs) for one in drawn]).reshape(
-                len(drawn), self.most_discs, 3
-            ),
+            np.array([one.initial_state for one in drawn], np.float64).reshape(count, n),
+            np.array([one.goal for one in drawn], np.float64).reshape(count, n),
+            np.array([self.all_discs(one.discs) for one in drawn]).reshape(count, most, 3),
         )
 
     def all_discs(self, discs: FloatArray) -> FloatArray:
