@@ -8,6 +8,7 @@ which `lagros export` makes C and ONNX. It may use `+ - * /`, integer powers, `a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -77,11 +78,11 @@ def seen(see: See, observation: Float32Array) -> tuple[Float32Array, Float32Arra
         one = see(observation.tolist(), functions)
         signs = np.array(one.signs, np.float32) if one.signs else None
         return np.array(one.features, np.float32), signs
-    components: Any = np.moveaxis(observation, -1, 0).astype(np.float64, order="C")
+    rows = observation.reshape(-1, observation.shape[-1])
+    components: Any = rows.T.astype(np.float64, order="C")
     many = see(components, functions)
-    return _table(many.features, observation.shape[:-1]), (
-        _table(many.signs, observation.shape[:-1]) if many.signs else None
-    )
+    features, signs = (_table(columns, observation.shape[:-1]) for columns in many)
+    return features, signs if many.signs else None
 
 
 class View(Protocol):
@@ -213,7 +214,7 @@ def _turned(vector: Vector, axis: Vector) -> Vector:
 
 
 def _table(columns: Sequence[Any], shape: tuple[int, ...]) -> Float32Array:
-    table = np.empty((*shape, len(columns)), np.float32)
+    table = np.empty((math.prod(shape), len(columns)), np.float32)
     for place, column in enumerate(columns):
-        table[..., place] = column
-    return table
+        table[:, place] = column
+    return table.reshape(*shape, len(columns))

@@ -69,8 +69,8 @@ class EpisodeRange:
         if rows.ndim == 1:
             way, lean = abs(rows.item(_GOAL) - rows.item(_START)), abs(rows.item(_LEAN))
         else:
-            way = float(np.max(np.abs(rows[:, _GOAL] - rows[:, _START]), initial=0.0))
-            lean = float(np.max(np.abs(rows[:, _LEAN]), initial=0.0))
+            way = float(np.abs(rows[:, _GOAL] - rows[:, _START]).max(initial=0.0))
+            lean = float(np.abs(rows[:, _LEAN]).max(initial=0.0))
         if way > self.farthest or lean > self.steepest:
             raise ValueError(
                 f"the episode goes {way:.3g} m from a lean of {lean:.3g} rad; "
