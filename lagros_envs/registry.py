@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
 from pathlib import Path
+from shlex import quote
 from types import ModuleType
 from typing import Any
 
@@ -16,6 +18,7 @@ from lagros_envs.tasks import SHIPPED, Shipped
 
 ENTRY_POINTS = "lagros.tasks"  # the group in which an installed package names its tasks
 _FOUND: dict[str, Described] = {}
+_CALLED: dict[str, str] = {}  # what a user called those that are not shipped
 
 
 def task_names() -> tuple[str, ...]:
@@ -48,6 +51,19 @@ def task_named(name: str) -> Described:
     return _FOUND[name]
 
 
+def called(task: Described) -> str:
+    """Return what the command line takes for a task: its name, file, or module:class."""
+    if task.name in SHIPPED:
+        return task.name
+    if task.name in _CALLED:
+        return quote(_CALLED[task.name])
+    module = type(task).__module__
+    file = getattr(sys.modules.get(module), "__file__", None)
+    if file is not None and (module == "__main__" or module.startswith("lagros_envs.from_file.")):
+        module = file
+    return quote(f"{module}:{type(task).__qualname__}")
+
+
 def find_task(text: str) -> Described:
     """Return a task by what a user calls it, and register it.
 
@@ -59,6 +75,13 @@ def find_task(text: str) -> Described:
     Raises:
         ValueError: There is no such task, or something is wrong with it.
     """
+    found = _found(text)
+    if found.name not in (text, *SHIPPED):
+        _CALLED[found.name] = text
+    return found
+
+
+def _found(text: str) -> Described:
     from importlib.metadata import entry_points
 
     if text in task_names():
@@ -114,9 +137,7 @@ def register_task(task: Task) -> Task:
         # A file that is read again, or a cell of a notebook, makes the same class anew.
         same = _class_of(known) == _class_of(task)
         if (name == task.name or known.title == task.title) and not same:
-            raise ValueError(
-                f"{whose} are those of another task, {' of '.join(_class_of(known))}; choose others"
-            )
+            raise ValueError(f"{whose} are those of another task, {called(known)}; choose others")
     _FOUND[task.name] = task
     register_env(task.name, Shipped("", task.title, task.steps))
     return task

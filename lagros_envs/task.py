@@ -180,7 +180,8 @@ class Task(Described):
         metric: The contraction metric; None for none.
         feedback: What u* prefers, and the weights of the regulators; None for Bryson's rule.
         learning: How its networks are made; None for none.
-        weights: Folder of its metric and networks; None for those of the package.
+        weights: Folder of its metric and networks; None for that of its `lagros reproduce`,
+            `runs/reproduce-NAME` from the working directory.
         features: What its networks see, a method of an observation's components and the functions
             that they may use, written like an equation of motion; None for the usual.
     """

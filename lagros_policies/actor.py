@@ -196,7 +196,9 @@ class ActorPolicy(BasePolicy):
         """Load the actor; see the class for the arguments."""
         self.settings = task = task_of(settings)
         if weights is None:
-            weights = found_file(task, f"{self.recorded_as or self.name}.safetensors", "train")
+            made = self.recorded_as or self.name
+            options = "--residual BETA" if made == "residual" else f"--algo {made}"
+            weights = found_file(task, f"{made}.safetensors", options)
         self.actor = actor = weights if isinstance(weights, Actor) else Actor.load(weights)
         what = "the actor" if isinstance(weights, Actor) else str(weights)
         self._check_episodes = check_weights(

@@ -20,7 +20,7 @@ from lagros_policies.baselines import regulator_weights
 from lagros_policies.contraction import ContractionMetric, HeldControl, load_metric
 from lagros_policies.contraction.feedback import riccati_gains
 from lagros_policies.planning.planner import planner_of
-from lagros_policies.room import found_file, part_of, shipped_file
+from lagros_policies.room import found_file, part_of, reproducing, shipped_file
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -119,7 +119,7 @@ def metric_of(task: Task) -> ContractionMetric:
     if task.metric is None and task.room is None and not made:
         raise ValueError(
             f"{task.name} has no contraction metric: describe one in its class by `metric = "
-            f"MetricDesign(...)`, and make it by `lagros reproduce {task.name}`"
+            f"MetricDesign(...)`, and make it by `{reproducing(task)}`"
         )
     return load_metric(found_file(task, "metric.json"), task.system.state_dim)
 

@@ -21,11 +21,13 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from lagros_envs.conventions import settings_of
-from lagros_envs.registry import task_named, task_names
+from lagros_envs.registry import called, task_named, task_names
 from lagros_envs.task import Described, Task
+from lagros_envs.tasks import SHIPPED
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 
@@ -70,32 +72,55 @@ def task_of(settings: Task | Mapping[str, Any] | None) -> Task:
     return found
 
 
+def run_folder(task: Described) -> Path:
+    """Return where `lagros reproduce` keeps a run of a task, from the working directory."""
+    return Path(f"runs/reproduce-{task.name}")
+
+
+def weights_folder(task: Described) -> Path:
+    """Return the folder of a task's metric and networks: its own, the package's, or of its run."""
+    own = getattr(task, "weights", None)
+    if own is not None:
+        return Path(own)
+    return PRETRAINED if task.name in SHIPPED else run_folder(task)
+
+
 def shipped_file(task: Described, what: str) -> Path:
     """Return where a task's file of weights is, or would be.
 
     Args:
         task: The task.
-        what: Its part of the name, such as "metric.json" or "lagros.safetensors".
+        what: Its part of the name, such as "metric.json" or "lagros.safetensors"; a run calls its
+            metric by this alone.
     """
-    folder = getattr(task, "weights", None) or PRETRAINED
-    return Path(folder) / f"{task.name}_{what}"
+    folder = weights_folder(task)
+    path, short = folder / f"{task.name}_{what}", folder / what
+    return short if short.is_file() and not path.is_file() else path
 
 
-def found_file(task: Described, what: str, command: str = "reproduce") -> Path:
+def found_file(task: Described, what: str, train: str = "") -> Path:
     """Return a task's file of weights.
 
     Args:
         task: The task.
         what: As for `shipped_file`.
-        command: Of `lagros`, that makes it.
+        train: Options of `lagros train` that makes it; "" where `lagros reproduce` does.
 
     Raises:
         FileNotFoundError: It has not been made.
     """
     path = shipped_file(task, what)
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{task.name} has no {path.name} in {path.parent}; `lagros {command} {task.name}` makes"
-            " it (of a task of your own, name the file)"
-        )
+        if train:
+            made = f"`lagros train {called(task)} {train}` makes it, to be copied there"
+        else:
+            made = f"`{reproducing(task)}` makes it"
+        raise FileNotFoundError(f"{task.name} has no {path.name} in {path.parent}; {made}")
     return path
+
+
+def reproducing(task: Described) -> str:
+    """Return the command that makes metric and networks where the policies of a task look."""
+    folder = weights_folder(task)
+    usual = folder in (PRETRAINED, run_folder(task))
+    return f"lagros reproduce {called(task)}" + ("" if usual else f" --out {quote(str(folder))}")

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import shlex
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from lagros_envs import Scenario, Task, find_task, register_task
 from lagros_envs.check_task import check_task
-from lagros_envs.registry import task_named, task_names
+from lagros_envs.registry import called, task_named, task_names
 from lagros_envs.tasks import SHIPPED
 
 FILE = Path(__file__).parent / "files" / "puck.py"
@@ -39,6 +40,22 @@ def test_a_task_of_a_file_is_found_and_registered(text, monkeypatch):
     assert type(found) is Puck
     assert "puck" in task_names()
     assert gym.make("lagros/Puck-v0").unwrapped.settings == PUCK
+
+
+@pytest.mark.parametrize("text", ["./puck.py", "puck.py:Puck", "{file}"])
+def test_what_a_task_is_called_in_a_command_is_what_finds_it(text, monkeypatch, tmp_path):
+    (tmp_path / "puck.py").write_text(FILE.read_text().replace('"puck", "Puck"', '"tin", "Tin"'))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lagros_envs.registry._FOUND", {})
+    monkeypatch.setattr("lagros_envs.registry._CALLED", {})
+    task = find_task(text.format(file=tmp_path / "puck.py"))
+    assert called(task) == text.format(file=tmp_path / "puck.py")
+    # In a process that was only sent the task, the file is known by its class.
+    monkeypatch.setattr("lagros_envs.registry._CALLED", {})
+    (found,) = shlex.split(called(task))
+    assert find_task(found) == task
+    for name in SHIPPED:
+        assert called(task_named(name)) == name
 
 
 def write(folder, text):

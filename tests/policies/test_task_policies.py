@@ -10,9 +10,10 @@ import scipy.linalg
 from stable_baselines3 import PPO
 
 from lagros_envs.env import TaskEnv
-from lagros_envs.registry import task_named, task_names
+from lagros_envs.registry import called, task_named
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.task import Scenario, Task
+from lagros_envs.tasks import SHIPPED
 from lagros_envs.vector import TaskVectorEnv
 from lagros_policies import make
 from lagros_policies.actor import Actor, ActorPolicy, goal_frame
@@ -21,6 +22,7 @@ from lagros_policies.contraction import BoxRegion, CvStemSettings, design_on_reg
 from lagros_policies.contraction.basis import harmonics
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.policy import BasePolicy, Policy, policy_names
+from lagros_policies.room import found_file, shipped_file, weights_folder
 from lagros_policies.sb3_model import StableBaselines3Policy
 from lagros_policies.trained_for import check_weights, training_of, weights_record
 from lagros_policies.tube_mpc import TubeMpcPolicy
@@ -320,10 +322,40 @@ def test_all_settings_of_a_task_are_those_of_the_training():
             check_weights(other, {}, "weights", policy, timed=True)
 
 
+@pytest.mark.parametrize(
+    ("weights", "command"),
+    [
+        (None, "`lagros reproduce tests.policies.toys:Slide` makes it"),
+        ("made here", "`lagros reproduce tests.policies.toys:Slide --out 'made here'` makes it"),
+    ],
+)
+def test_what_reproduce_makes_is_where_policies_look(weights, command, monkeypatch, tmp_path):
+    """Of a task of a user's own; those of the package have their files there."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Slide, "weights", weights)
+    for what in ("metric.json", "lagros.safetensors"):
+        with pytest.raises(FileNotFoundError, match="slide has no slide_") as caught:
+            found_file(Slide(), what)
+        assert str(caught.value).endswith(command)
+    with pytest.raises(
+        FileNotFoundError, match=r"`lagros train .*Slide --algo sac` makes it, to be"
+    ):
+        make("sac", TaskEnv(task=Slide()))
+    folder = tmp_path / (weights or "runs/reproduce-slide")
+    folder.mkdir(parents=True)
+    # As in the folder of a run, and under the name that a file beside others has.
+    for name in ("metric.json", "slide_metric.json", "slide_lagros.safetensors"):
+        (folder / name).touch()
+        found = shipped_file(Slide(), name.removeprefix("slide_"))
+        assert found.resolve() == folder / name
+    for name in SHIPPED:
+        assert weights_folder(task_named(name)).is_absolute()
+
+
 # All policies of all tasks
 
 
-EVERY = [(task, name) for task in task_names() for name in policy_names(task_named(task))]
+EVERY = [(task, name) for task in SHIPPED for name in policy_names(task_named(task))]
 
 
 @pytest.mark.parametrize(("task", "name"), EVERY)
@@ -334,7 +366,8 @@ def test_every_policy_of_every_task_can_be_asked_everything(task, name):
     except FileNotFoundError as error:
         missing = str(error)
     if missing:
-        assert f"`lagros reproduce {task}`" in missing or f"`lagros train {task}`" in missing
+        commands = (f"`lagros {name} {called(task_named(task))}" for name in ("reproduce", "train"))
+        assert any(command in missing for command in commands)
         return
     assert isinstance(policy, BasePolicy)
     assert isinstance(policy, Policy)

@@ -260,12 +260,13 @@ def reproduce(
     from lagros_benchmarks.run.room import room_of
     from lagros_envs.registry import find_task
     from lagros_policies.backends import Backend, BackendError, running
+    from lagros_policies.room import run_folder
 
     find_users_modules((task,))
     place = folder or Path("runs/reproduce")
     try:
         described = find_task(task)
-        place = folder or Path(f"runs/reproduce-{described.name}")
+        place = folder or run_folder(described)
         room = room_of(described)
         if not shipped:
             check_extra("lagros reproduce", "train")

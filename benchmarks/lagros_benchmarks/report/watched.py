@@ -87,7 +87,7 @@ class SingleGame:
         info = self._loop.info
         success = info["success"] and self.error is None
         reached = f"success at {info['success_time']:.1f} s" if success else "no success"
-        end = "collided" if info.get("collided") else "fallen" if info["fallen"] else "upright"
+        end = "collided" if info.get("collided") else "fallen" if info["fallen"] else "not fallen"
         unit = self.env.settings.control_unit
         spent = efforts("effort", info["effort_to_success"], info["effort"], unit)
         return f"{reached}, {end}, {spent}"
@@ -102,7 +102,7 @@ def efforts(what: str, to_success: float, to_end: float, unit: str) -> str:
         to_end: To the end of the episode.
         unit: Of the control; "" for none.
     """
-    unit = f"({unit})" if "/" in unit else unit
+    unit = f"({unit})" if "/" in unit or " " in unit else unit
     squared = f" {unit}²s" if unit else ""
     if to_end == to_success:
         return f"{what} {to_end:.2f}{squared}"

@@ -18,6 +18,7 @@ from lagros_benchmarks.run.library import Toolbox
 from lagros_benchmarks.run.settings import BenchmarkSettings
 from lagros_benchmarks.run.surroundings import machine, threads, versions
 from lagros_policies.naming import is_file, model_file, user_class
+from lagros_policies.room import weights_folder
 
 _PACKAGES = ("lagros_envs", "lagros_policies", "lagros_benchmarks")
 # Modules, weights and settings that a class of the user's own may read.
@@ -60,9 +61,9 @@ def fingerprint(settings: BenchmarkSettings, toolbox: Toolbox) -> str:
 def _task_files(task: Any) -> list[Path]:
     """Return the file in which a task is described, and its weights."""
     described = inspect.getsourcefile(type(task))
-    weights = getattr(task, "weights", None)
     own = [] if described is None else [Path(described)]
-    return own + ([] if weights is None else _files(Path(weights)))
+    folder = weights_folder(task)
+    return own + sorted([folder / "metric.json", *folder.glob(f"{task.name}_*")])
 
 
 def _named_files(value: Any) -> Iterator[tuple[str, list[Path]]]:
