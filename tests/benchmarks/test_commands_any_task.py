@@ -117,7 +117,7 @@ def test_an_attack_is_searched_flown_and_flown_again(invoke: Any) -> None:
     result = invoke(*arguments, "--goal", "clearance", "--json", "a.json", "--npz", "a.npz")
     assert result.exit_code == 0, result.output
     row = json.loads(Path("a.json").read_text())
-    assert (row["task"], row["bound"], row["episodes"]) == ("puck", 0.3, 2)
+    assert (row["task"], row["bound"], row["episodes"]) == ("slider", 0.3, 2)
     assert row["score_worst"] > row["random_score_worst"]
     assert row["least_gap_min"] < 0.0
     assert "in_region_rate" not in row
@@ -140,8 +140,8 @@ def test_what_a_task_of_one_body_lacks_is_said(invoke: Any) -> None:
         (("watch", FILE, "--agents", 2), "--agents is for worlds of many agents"),
         (("attack", FILE, "--safety-filter"), "for worlds of many agents"),
         (("train", FILE, "--parallel-env"), "--parallel-env is for many agents"),
-        (("certify", FILE), "puck has no metric of its own"),
-        (("data", "export", "--minari", "--task", FILE), "puck has no contraction metric"),
+        (("certify", FILE), "slider has no metric of its own"),
+        (("data", "export", "--minari", "--task", FILE), "slider has no contraction metric"),
     ):
         result = invoke(*options)
         assert result.exit_code in (1, 2), result.output
@@ -266,14 +266,14 @@ def test_an_agent_learns_and_its_weights_fly(name: str, invoke: Any, monkeypatch
     if name == "td3":
         algorithm = Td3(batch_size=16, warm_up=16, hidden=(8,), buffer_size=200)
     small = {"segment_steps": 20, "worlds": 4, "curve_episodes": 5, "final_episodes": 5}
-    tiny = replace(default_training("puck", name), algorithm=algorithm, **small)
+    tiny = replace(default_training("slider", name), algorithm=algorithm, **small)
     assert tiny.disturbance_bound == 0.1
     monkeypatch.setattr(SingleCourse, "trainings", lambda *_: {name: tiny})
     files = ("--json", "curves.json", "--figure", "curves.png")
     result = invoke("train", FILE, "--algo", name, "--segments", 2, "--out", "runs", *files)
     assert result.exit_code == 0, result.output
     assert "coll." in result.output
-    folder = Path("runs") / f"puck-{name}" / "seed-0"
+    folder = Path("runs") / f"slider-{name}" / "seed-0"
     env = gym.make(SLIDE.env_id, disturbance="uniform", disturbance_bound=0.1)
     policy = lagros_policies.make(name, env, weights=folder / "weights.safetensors")
     seeds = episode_seeds(0, 5, FINAL)

@@ -177,7 +177,7 @@ def test_the_cart_pole_is_filmed_too(invoke, tmp_path):
         *("cartpole", "--policy", "lqr", "--seconds", 1, "--speed", 1, "--video", "c.gif")
     )
     assert result.exit_code == 0, result.output
-    assert "lqr on seed 0, uniform d̄ = 0.75: no success, upright" in result.output
+    assert "lqr on seed 0, uniform d̄ = 0.75: no success, not fallen" in result.output
     frames, _ = frames_of(tmp_path / "c.gif")
     assert frames[0].shape == (400, 800, 3)
     assert np.any(frames[0] != frames[-1])

@@ -31,7 +31,7 @@ class Slide(Task):
     control_period: float = 0.2
     time_limit: float = 4.0
 
-    name, title = "puck", "Puck"
+    name, title = "slider", "Slider"
     state_names = ("x [m]", "y [m]", "vx [m/s]", "vy [m/s]")
     control_names = ("right [m/s^2]", "up [m/s^2]")
     control_low, control_high, control_scale = (-2.0, -2.0), (2.0, 2.0), (2.0, 2.0)

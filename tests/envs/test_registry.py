@@ -240,7 +240,7 @@ def test_names_that_are_taken_are_refused():
         with pytest.raises(ValueError, match="are taken by the task 'cartpole' of this package"):
             register_task(faulty(**changes))
     for changes in ({"name": "puck"}, {"title": "Puck"}):
-        with pytest.raises(ValueError, match="are those of another task, Puck of"):
+        with pytest.raises(ValueError, match="are those of another task, "):
             register_task(faulty(**changes))
     assert register_task(PUCK) is PUCK
     with pytest.raises(TypeError, match="the class Puck is no task: register_task takes an inst"):

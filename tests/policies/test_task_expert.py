@@ -216,5 +216,5 @@ def test_a_task_without_a_metric_is_refused_with_a_remedy(tmp_path):
     elsewhere = type("Elsewhere", (Slide,), {"weights": tmp_path})()
     with pytest.raises(FileNotFoundError, match=r"slide has no slide_metric.json in .*reproduce"):
         Expert(elsewhere)
-    with pytest.raises(FileNotFoundError, match=r"pretrained; `lagros reproduce slide` makes it"):
+    with pytest.raises(FileNotFoundError, match=r"slide; `lagros reproduce tests.*Slide` makes it"):
         Expert(Slide())
