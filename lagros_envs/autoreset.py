@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from lagros_envs.checks import check_name, shown
 from lagros_envs.conventions import (
     Conforming,
@@ -26,11 +27,6 @@ from lagros_envs.conventions import (
 from lagros_envs.disturbances import Disturbance
 from lagros_envs.options import known_options
 from lagros_envs.seeding import SharedStreams
-
-Float32Array = NDArray[np.float32]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
-FloatArray = NDArray[np.float64]
 
 MODES = {
     "next_step": AutoresetMode.NEXT_STEP,

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import (
     check_instance,
     check_not_negative,
@@ -25,8 +25,6 @@ from lagros_envs.dynamics.straight_line import recorded_measure
 from lagros_envs.numbers import functions
 from lagros_envs.rules import StepRules
 from lagros_envs.task import MetricDesign, Scenario, Task
-
-FloatArray = NDArray[np.float64]
 
 _SAMPLES = 8  # scenarios that are tried
 _AROUND = 0.05  # states beside them, as a share of the scale of each coordinate

@@ -15,13 +15,11 @@ from functools import cached_property
 from typing import Any, Literal, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_disturbance_bound, shown, suggestion
 from lagros_envs.options import real_numbers
 from lagros_envs.values import ByValue
-
-FloatArray = NDArray[np.float64]
 
 # Rounding must not carry a vector of norm one over the bound.
 INSIDE = 1.0 - 4.0 * np.finfo(np.float64).eps

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.canvas import (
     BLACK,
     BLUE,
@@ -27,8 +28,6 @@ from lagros_envs.canvas import (
 
 if TYPE_CHECKING:
     from lagros_envs.task import Task
-
-FloatArray = NDArray[np.float64]
 
 WIDTH, HEIGHT = 800, 500  # [px]
 PANEL = 230  # width of the panel with the figures beside the plane [px]

@@ -13,6 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from lagros_envs import of_task
+from lagros_envs.arrays import Float32Array, FloatArray
 from lagros_envs.conventions import (
     RENDER_MODES,
     Conforming,
@@ -33,13 +34,11 @@ from lagros_envs.seeding import SharedStreams, episode_streams
 from lagros_envs.stepwise import StepwiseDisturbance
 from lagros_envs.task import LARGEST_DISTANCE, Scenario, Task, distance_between
 
-FloatArray = NDArray[np.float64]
-
 _NOT_YET = End.NOT_YET  # a member of an Enum is looked up slowly
 _READY = 64  # starts that are drawn in advance
 
 
-class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+class TaskEnv(OfTask, Conforming, gym.Env[Float32Array, Float32Array]):
     """One body with n states and m controls, held for a control step, and a bounded disturbance.
 
     ## Action
@@ -164,7 +163,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[Float32Array, dict[str, Any]]:
         """Start an episode.
 
         Args:
@@ -206,9 +205,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
             self.render()
         return self._observation(), self._info()
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Float32Array) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
         """Hold the control for one control step.
 
         Args:
@@ -311,7 +308,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
             self._ready = of_task.starts_of(self.settings, drawn)[::-1]
         return self._ready.pop()
 
-    def _control(self, action: NDArray[np.float32]) -> tuple[float, ...]:
+    def _control(self, action: Float32Array) -> tuple[float, ...]:
         if type(action) is np.ndarray and action.shape == self._shape and action.dtype.char in "fd":
             values = action.tolist()
         else:
@@ -371,7 +368,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[NDArray[np.float32], NDArray[np.float3
     def _nominal_index(self) -> int:
         return min(self._step, self._steps)
 
-    def _observation(self) -> NDArray[np.float32]:
+    def _observation(self) -> Float32Array:
         observation = self._blank.copy()
         # One by one: a few floats become an array more slowly than they are stored.
         for index, value in enumerate(self._state):

@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.checks import check_instance
 from lagros_envs.conventions import settings_of
 from lagros_envs.disturbances import Disturbance, channel_mask
@@ -20,7 +20,6 @@ from lagros_envs.options import nominal_option, option_numbers
 from lagros_envs.registry import task_named
 from lagros_envs.task import LARGEST_CONTROL, Numbers, Scenario, Task
 
-FloatArray = NDArray[np.float64]
 Channels = Literal["all", "rates"] | Sequence[bool]
 
 
@@ -39,7 +38,7 @@ class Start(NamedTuple):
     goal: tuple[float, ...]
     discs: FloatArray
     fixed: tuple[float, ...]
-    blank: NDArray[np.float32]
+    blank: Float32Array
 
 
 class OfTask:
@@ -145,7 +144,7 @@ def stated_scenario(
     options: dict[str, Any],
     task: Task,
     batch: tuple[int, ...] = (),
-    looked_at: NDArray[np.bool_] | None = None,
+    looked_at: BoolArray | None = None,
 ) -> dict[str, FloatArray]:
     """Return the parts of a `Scenario` that the options hold.
 
@@ -175,7 +174,7 @@ def stated_scenario(
 
 
 def _goal(
-    value: Any, task: Task, shape: tuple[int, ...], looked_at: NDArray[np.bool_] | None
+    value: Any, task: Task, shape: tuple[int, ...], looked_at: BoolArray | None
 ) -> FloatArray:
     short = task.short_goal
     # One coordinate alone is no list.
@@ -189,7 +188,7 @@ def _goal(
 
 
 def _discs(
-    value: Any, task: Task, batch: tuple[int, ...], looked_at: NDArray[np.bool_] | None
+    value: Any, task: Task, batch: tuple[int, ...], looked_at: BoolArray | None
 ) -> FloatArray:
     shapes = [(*batch, count, 3) for count in range(task.most_discs + 1)]
     # An empty list has no axis of three.
@@ -206,7 +205,7 @@ def stated_nominal(
     options: dict[str, Any],
     task: Task,
     batch: tuple[int, ...] = (),
-    looked_at: NDArray[np.bool_] | None = None,
+    looked_at: BoolArray | None = None,
 ) -> FloatArray | None:
     """Return x_d at every control instant, shape (*batch, steps + 1, n), if the options hold it.
 

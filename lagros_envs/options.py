@@ -10,11 +10,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.checks import LARGEST, shown, suggestion
-
-FloatArray = NDArray[np.float64]
 
 # Axes of any option.
 _DEEPEST = 4
@@ -84,7 +82,7 @@ def option_numbers(
     name: str,
     value: Any,
     *shapes: tuple[int, ...],
-    looked_at: NDArray[np.bool_] | None = None,
+    looked_at: BoolArray | None = None,
     meaning: str = "",
 ) -> FloatArray:
     """Return a copy of an option in double precision.
@@ -125,7 +123,7 @@ def nominal_option(
     options: dict[str, Any],
     shape: tuple[int, ...],
     meaning: str,
-    looked_at: NDArray[np.bool_] | None = None,
+    looked_at: BoolArray | None = None,
 ) -> FloatArray | None:
     """Return a copy of the option `nominal`, x_d at every control instant, if there is one.
 

@@ -22,9 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import is_finite, is_whole, shown
-
-FloatArray = NDArray[np.float64]
 
 # More than any file of ours has [bytes], and little enough to be read at once.
 MOST_BYTES = 1 << 30

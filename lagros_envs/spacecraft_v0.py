@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-import numpy as np
-from numpy.typing import NDArray
 from pettingzoo import AECEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
+from lagros_envs.arrays import Float32Array
 from lagros_envs.tasks.spacecraft.parallel import SpacecraftParallelEnv
 
 __all__ = ["env", "parallel_env", "raw_env"]
@@ -20,7 +19,7 @@ __all__ = ["env", "parallel_env", "raw_env"]
 parallel_env = SpacecraftParallelEnv
 
 
-def env(**arguments: Any) -> AECEnv[str, NDArray[np.float32], NDArray[np.float32] | None]:
+def env(**arguments: Any) -> AECEnv[str, Float32Array, Float32Array | None]:
     """Return the environment in PettingZoo's agent-environment-cycle form."""
     # The conversion asks for None as an action, which is how an agent that is done steps out.
     return parallel_to_aec(cast(Any, parallel_env(**arguments)))

@@ -11,8 +11,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray, IntArray
 from lagros_envs.disturbances import (
     GUST_CORRELATION_TIME,
     GUST_SPREAD,
@@ -20,9 +20,6 @@ from lagros_envs.disturbances import (
     SINUSOID_RATES,
     Disturbance,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 # Numbers of draws in a row, where there are fewer worlds: a call costs as much as a hundred draws.
 _BLOCK = 64

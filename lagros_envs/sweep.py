@@ -6,11 +6,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
+from lagros_envs.arrays import BoolArray, FloatArray, IntArray
 
 
 class Path(NamedTuple):

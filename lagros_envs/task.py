@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import (
     LARGEST,
     check_at_most,
@@ -58,8 +59,6 @@ __all__ = [
     "Task",
     "distance_between",
 ]
-
-FloatArray = NDArray[np.float64]
 
 # Farther from its goal than this the integration has diverged under an enormous control.
 LARGEST_DISTANCE = 1e12

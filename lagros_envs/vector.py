@@ -8,9 +8,9 @@ from typing import Any, Literal, NamedTuple, cast
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
-from numpy.typing import NDArray
 
 from lagros_envs import of_task
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from lagros_envs.autoreset import RestartingVectorEnv, nominal_after
 from lagros_envs.checks import check_whole
 from lagros_envs.conventions import check_started
@@ -23,10 +23,6 @@ from lagros_envs.rules import Rows, StepRules
 from lagros_envs.seeding import seeded_streams
 from lagros_envs.stepwise import StepwiseDisturbance
 from lagros_envs.task import LARGEST_DISTANCE, Scenario, Task, distance_between
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
 
 # Starts that are drawn in advance.
 _READY = 2048
@@ -41,7 +37,7 @@ class _Starts(NamedTuple):
     """
 
     kept: FloatArray
-    blank: NDArray[np.float32]
+    blank: Float32Array
 
 
 class TaskVectorEnv(OfTask, RestartingVectorEnv):
@@ -150,8 +146,8 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
         self._taken = 0
 
     def step(
-        self, actions: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        self, actions: Float32Array
+    ) -> tuple[Float32Array, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Hold the controls of every world for one control step.
 
         Args:
@@ -321,7 +317,7 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
         stored = self._pushes.reshape(-1, self._dim).take(place, axis=0).T
         return stored if drawn is None else np.where(advance, stored, drawn)
 
-    def _control(self, actions: NDArray[np.float32]) -> list[FloatArray]:
+    def _control(self, actions: Float32Array) -> list[FloatArray]:
         """Return the controls, each an array of worlds."""
         shape = (self.num_envs, len(self._actuators))
         usual = type(actions) is np.ndarray and actions.dtype == np.float32
@@ -358,7 +354,7 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
             return None
         return self.nominal[self._worlds, np.minimum(self._step, self._steps)]
 
-    def _observation(self) -> NDArray[np.float32]:
+    def _observation(self) -> Float32Array:
         observation = self._blank.copy()
         # One by one: quicker than to turn all of them.
         for column in range(self._dim):

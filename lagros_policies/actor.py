@@ -13,6 +13,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.checks import check_positive, shown
 from lagros_envs.task import Numbers, Task
 from lagros_policies.learning.networks import Mlp, read_safetensors, write_safetensors
@@ -21,8 +22,6 @@ from lagros_policies.policy import BasePolicy
 from lagros_policies.room import found_file, task_of
 from lagros_policies.trained_for import KEYS, check_weights
 
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
 Squash = Literal["clip", "tanh"]
 
 SQUASHES: tuple[Squash, ...] = ("clip", "tanh")
@@ -225,7 +224,7 @@ class ActorPolicy(BasePolicy):
         self,
         observation: NDArray[Any],
         state: Any = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, Any]:
         """Return the mean action and the state as it came; see `Policy.predict`.

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.checks import check_seed, shown
 from lagros_envs.dynamics import control_matrix, hold_step, linearise_hold, vector_field
 from lagros_envs.options import real_numbers
@@ -15,9 +16,6 @@ from lagros_envs.task import Feedback, Task
 from lagros_policies.observed import observed_rows
 from lagros_policies.policy import BasePolicy
 from lagros_policies.room import part_of, task_of
-
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
 
 # A state whose rate is below this share of its scale per second is held.
 _AT_REST = 1e-9
@@ -130,7 +128,7 @@ class LqrPolicy(BasePolicy):
         self,
         observation: NDArray[Any],
         state: Any = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, Any]:
         """Return u_f - K (x - x_f) as an action, and the state as it came.
@@ -273,7 +271,7 @@ class RandomPolicy(BasePolicy):
         self,
         observation: NDArray[Any],
         state: Any = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, Any]:
         """Draw one action per row of the observation, and return the state as it came.

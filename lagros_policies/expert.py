@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_envs.aliases import moved_names
+from lagros_envs.arrays import FloatArray, IntArray
 from lagros_envs.dynamics import linearise_hold
 from lagros_envs.task import Feedback, Task
 from lagros_policies.baselines import regulator_weights
@@ -22,8 +22,6 @@ from lagros_policies.contraction.feedback import riccati_gains
 from lagros_policies.planning.planner import planner_of
 from lagros_policies.room import found_file, part_of, reproducing, shipped_file
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 moved_names(__name__)
 
 

@@ -8,16 +8,15 @@ from collections.abc import Callable
 from typing import Any, ClassVar, Literal, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_envs.aliases import moved_names
+from lagros_envs.arrays import BoolArray, Float32Array
 from lagros_envs.checks import check_flag, shown, suggestion
 from lagros_envs.task import Described
 from lagros_policies.naming import UserClass, model_file, user_class
 from lagros_policies.room import imported, named_in
 from lagros_policies.wrappers import bare_environment
 
-Float32Array = NDArray[np.float32]
 # What a planner remembers between calls; stateless policies keep None.
 PolicyState = Any
 Observes = Literal["local", "global"]
@@ -54,7 +53,7 @@ class Policy(Protocol):
         self,
         observation: Float32Array,
         state: PolicyState = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Choose an action.
@@ -96,7 +95,7 @@ class BasePolicy:
         self,
         observation: Float32Array,
         state: PolicyState = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Choose an action; see `Policy.predict`."""
@@ -151,7 +150,7 @@ class AdaptedPolicy(BasePolicy):
         self,
         observation: Float32Array,
         state: PolicyState = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Ask the object; see `Policy.predict`."""
@@ -227,7 +226,7 @@ Memory = TypeVar("Memory")
 
 def row_memories(
     state: PolicyState,
-    episode_start: NDArray[np.bool_] | None,
+    episode_start: BoolArray | None,
     count: int,
     rows: str,
     kind: type[Memory],

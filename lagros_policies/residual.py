@@ -5,16 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, Float32Array
 from lagros_envs.task import Task
 from lagros_policies.actor import Actor, ActorPolicy
 from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.policy import BasePolicy, PolicyState
 from lagros_policies.room import task_of
-
-Float32Array = NDArray[np.float32]
 
 
 class Correction(ActorPolicy):
@@ -70,7 +68,7 @@ class ResidualPolicy(BasePolicy):
         self,
         observation: NDArray[Any],
         state: PolicyState = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Return the sum of both actions and the state as it came; see `Policy.predict`."""

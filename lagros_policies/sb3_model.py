@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, Float32Array
 from lagros_envs.reading import check_file, parse_json
 from lagros_envs.registry import task_named, task_names
 from lagros_envs.task import Described, Task
@@ -19,8 +20,6 @@ from lagros_policies.naming import ALGORITHMS
 from lagros_policies.observed import as_numbers
 from lagros_policies.policy import BasePolicy
 from lagros_policies.room import part_of
-
-Float32Array = NDArray[np.float32]
 
 # What a file may expand to [bytes] and how many entries it may have: a policy of a hundred layers
 # has less.
@@ -93,7 +92,7 @@ class StableBaselines3Policy(BasePolicy):
         self,
         observation: NDArray[Any],
         state: Any = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, Any]:
         """Return the model's action and state; see `Policy.predict`.

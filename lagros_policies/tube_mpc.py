@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.checks import check_above, check_whole, shown
 from lagros_envs.task import Task
 from lagros_policies.contraction import ContractionMetric, load_metric
@@ -20,10 +20,6 @@ from lagros_policies.planning import Trajectory
 from lagros_policies.policy import BasePolicy, PolicyState, row_memories
 from lagros_policies.room import task_of
 from lagros_policies.trained_for import body_values, check_trained_for, usual
-
-Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
-
 
 # Controls that differ by less are one plan, in scales of the plan; the solver's own tolerance is
 # below it.
@@ -121,7 +117,7 @@ class TubeMpcPolicy(BasePolicy):
         self,
         observation: Float32Array,
         state: PolicyState = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Plan if it is time, and track; see `Policy.predict`. The state is one per row.

@@ -10,13 +10,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.dynamics.straight_line import straight_line
 from lagros_envs.dynamics.system import System, components
 from lagros_envs.numbers import dual, exact, functions, variable
-
-FloatArray = NDArray[np.float64]
 
 _DRAWS = 16
 # Half the width of the box around each state that intervals are tried on.

@@ -12,7 +12,6 @@ from typing import Any, cast
 
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
-from numpy.typing import NDArray
 
 from lagros_envs.dynamics.straight_line import (
     IMPORTS,
@@ -26,8 +25,6 @@ from lagros_envs.dynamics.straight_line import (
 from lagros_envs.dynamics.system import System
 from lagros_envs.numbers import Recorded, functions
 from lagros_envs.numbers.recorded import Operation
-
-FloatArray = NDArray[np.float64]
 
 # Adding and subtracting it rounds a double below 2**51 to an integer, in two operations that a
 # vector unit has.

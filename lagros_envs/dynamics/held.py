@@ -8,8 +8,8 @@ from functools import lru_cache, partial
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_flag
 from lagros_envs.dynamics.integrate import SUBSTEPS
 from lagros_envs.dynamics.straight_line import (
@@ -22,7 +22,6 @@ from lagros_envs.dynamics.straight_line import (
 )
 from lagros_envs.dynamics.system import System
 
-FloatArray = NDArray[np.float64]
 # From x, u, d and what is given, sequences of floats, to x at the end and what is measured there.
 FloatStep = Callable[..., tuple[tuple[float, ...], tuple[Any, ...]]]
 

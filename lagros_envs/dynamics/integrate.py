@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.dynamics.system import Components, System, components
 from lagros_envs.numbers import dual, functions
-
-FloatArray = NDArray[np.float64]
 
 # With 4 substeps of 0.025 s, halving the substep moves no state of a controlled 9 s episode by
 # 1e-4 (3e-5 along tracked least-effort plans); with 2 it moves some by 5e-4.

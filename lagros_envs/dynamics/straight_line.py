@@ -13,14 +13,12 @@ from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.dynamics.integrate import SUBSTEPS, rk4_hold
 from lagros_envs.dynamics.system import System
 from lagros_envs.numbers import functions as elementary
 from lagros_envs.numbers.recorded import Operation, Recorded, Tape, operand_text
-
-FloatArray = NDArray[np.float64]
 
 _UFUNCS: dict[str, Any] = {
     "+": np.add,

@@ -10,11 +10,10 @@ from collections.abc import Sequence
 from typing import Any, Protocol, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.numbers import dual, functions
 
-FloatArray = NDArray[np.float64]
 # One entry per coordinate: floats, arrays of a batch, or duals. The physics does not mind which.
 Components = Sequence[Any]
 

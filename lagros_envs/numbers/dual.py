@@ -9,11 +9,10 @@ from __future__ import annotations
 from typing import Any, Union
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.numbers.functions import cos, exp, power, sin, sqrt, tan
 
-FloatArray = NDArray[np.float64]
 Number = Union["Dual", FloatArray, float]
 
 

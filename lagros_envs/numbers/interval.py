@@ -11,12 +11,10 @@ import math
 from typing import Any, Union
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.numbers.functions import power
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Number = Union["Interval", FloatArray, float]
 
 # |x| 2^-52 is between one and two units in the last place of x. The second term covers underflow

@@ -9,13 +9,12 @@ from __future__ import annotations
 from typing import Any, Union
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.numbers.dual import Dual
 from lagros_envs.numbers.functions import power
 from lagros_envs.numbers.interval import Interval, exact
 
-FloatArray = NDArray[np.float64]
 Number = Union["Series", Dual, Interval, FloatArray, float]
 
 

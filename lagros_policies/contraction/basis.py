@@ -16,13 +16,12 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_several, check_whole, shown
 from lagros_envs.dynamics.system import Components, components
 from lagros_envs.numbers import Dual, functions
 
-FloatArray = NDArray[np.float64]
 # sin, cos or nothing; the coordinate; the power.
 Factor = tuple[str, int, int]
 

@@ -12,12 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lagros_envs.arrays import FloatArray
 from lagros_policies.contraction.statement import Statement
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.dynamics import (
     System,
     control_matrix,
@@ -31,7 +31,6 @@ __all__ = [
     "verify_metric",
 ]
 
-FloatArray = NDArray[np.float64]
 Verified = TypeVar("Verified", bound=ContractionMetric)
 
 # How well A e must give the difference of the motions, of which A is the mean slope.

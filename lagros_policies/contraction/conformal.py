@@ -17,11 +17,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_policies.contraction.statement import Statement
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

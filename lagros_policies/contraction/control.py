@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_positive
 from lagros_envs.dynamics import (
     System,
@@ -18,8 +18,6 @@ from lagros_envs.dynamics import (
 )
 from lagros_policies.contraction.metric import ContractionMetric, metric_place
 from lagros_policies.contraction.systems import check_sizes, check_unmoved
-
-FloatArray = NDArray[np.float64]
 
 # Eigenvalues below this share of the largest are zero but for rounding.
 _UNSEEN = 1e-13

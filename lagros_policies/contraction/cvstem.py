@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray, IntArray
 from lagros_envs.checks import check_whole
 from lagros_envs.dynamics import System
 from lagros_policies.contraction.basis import Basis
@@ -38,8 +38,6 @@ __all__ = [
     "design_on_region",
     "search_rate",
 ]
-
-FloatArray = NDArray[np.float64]
 
 # Angles at which I <= W_bar <= chi I is imposed, and looked at afterwards; and states of a region
 # at which it is imposed first.
@@ -219,7 +217,7 @@ def search_rate(
 def _design(
     system: System,
     pool: Samples,
-    active: NDArray[np.intp],
+    active: IntArray,
     region: MetricRegion,
     settings: CvStemSettings,
     effort: _Effort,
@@ -279,7 +277,7 @@ def _bounds(
     phi: Basis,
     point: Point,
     n: int,
-) -> tuple[float, float, FloatArray, NDArray[np.bool_]]:
+) -> tuple[float, float, FloatArray, BoolArray]:
     """Return the extreme eigenvalues of the scaled W_bar, and where to bound it next.
 
     Returns:
@@ -328,7 +326,7 @@ def _residual(
     return pool, residual
 
 
-def _broken(residual: FloatArray, effort: _Effort) -> NDArray[np.intp]:
+def _broken(residual: FloatArray, effort: _Effort) -> IntArray:
     """Return the samples to add: the worst, or the worst of each part of a pool in random order."""
     order = np.argsort(residual)[::-1]
     worst = order[: min(effort.first, int(np.sum(residual > 0.0)))]

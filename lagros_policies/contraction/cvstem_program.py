@@ -15,9 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 from lagros_envs.dynamics import System, vector_field
 from lagros_policies.contraction.basis import CONSTANT, Basis
@@ -33,8 +33,6 @@ from lagros_policies.contraction.semidefinite import (
     symmetric_basis,
 )
 from lagros_policies.contraction.systems import check_basis_unmoved, check_sizes
-
-FloatArray = NDArray[np.float64]
 
 
 class InfeasibleError(ValueError):

@@ -24,12 +24,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_disturbance_bound, check_not_negative, check_positive
 from lagros_policies.contraction.tube import Tube
-
-FloatArray = NDArray[np.float64]
 
 # Panels of the integral over a hold; its excess is below 1e-8 of it.
 _PANELS = 2000

@@ -14,8 +14,8 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.dynamics import System, control_matrix, vector_field
 from lagros_envs.numbers import Interval, exact
 from lagros_policies.contraction.basis import CONSTANT
@@ -26,8 +26,6 @@ from lagros_policies.proof.cells import Search, search
 from lagros_policies.proof.families import BoxCondition, Violation, rate_matrices
 from lagros_policies.proof.matrices import negative_definite
 from lagros_policies.proof.sets import triples
-
-FloatArray = NDArray[np.float64]
 
 # ||phi_1||^2 below which the control has no effect on V.
 _TINY = 1e-300

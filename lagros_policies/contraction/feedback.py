@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_envs.aliases import moved_names
+from lagros_envs.arrays import FloatArray
 
 moved_names(__name__)
-FloatArray = NDArray[np.float64]
 
 # The terminal weight, in units of the last stage weight.
 _TERMINAL_WEIGHT = 10.0

@@ -33,17 +33,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 from lagros_envs.dynamics import System
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.semidefinite import solve_conic, svec, symmetric_basis
 from lagros_policies.contraction.systems import check_sizes
 from lagros_policies.contraction.tube_design import Plans, self_contained
-
-FloatArray = NDArray[np.float64]
 
 # Each program has but the samples that matter: some first, then the worst that its answer violates.
 _WORST = 30

@@ -6,7 +6,6 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_envs.aliases import moved_names
 from lagros_envs.dynamics import System
@@ -18,7 +17,6 @@ from lagros_policies.proof.matrices import matmul, negative_definite, transpose
 from lagros_policies.proof.sets import triples
 
 moved_names(__name__)
-FloatArray = NDArray[np.float64]
 
 # The shortest hold that is covered, as a share of the longest, where shorter ones are.
 SHORTEST = 1e-6

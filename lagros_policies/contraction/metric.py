@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Any, Protocol, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_at_least, check_name, check_positive, check_whole
 from lagros_policies.contraction.basis import CONSTANT, MOST_DEGREE, Basis, cosines
 from lagros_policies.contraction.places import (
@@ -19,8 +19,6 @@ from lagros_policies.contraction.places import (
     places_of,
 )
 from lagros_policies.contraction.regions import MetricRegion, even_coordinate
-
-FloatArray = NDArray[np.float64]
 
 # Points of a grid, or states of the region, at which W_bar must be positive definite, and its least
 # eigenvalue, of W_bar scaled to a unit diagonal: far above rounding, far below any design.

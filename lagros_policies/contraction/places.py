@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_policies.contraction.basis import CONSTANT, Basis
 from lagros_policies.contraction.regions import (
     MetricRegion,
@@ -16,7 +16,6 @@ from lagros_policies.contraction.regions import (
     search_region,
 )
 
-FloatArray = NDArray[np.float64]
 # Whether W_bar is a function of x or of x_d.
 Point = Literal["state", "nominal"]
 

@@ -13,14 +13,12 @@ from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_envs.aliases import moved_names
+from lagros_envs.arrays import BoolArray, FloatArray, IntArray
 from lagros_envs.checks import check_fields, check_positive, check_whole, is_number, shown
 
 moved_names(__name__)
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Numbers = tuple[float, ...]
 
 # Triples that the search for a maximum begins with, follows, and tries around each.
@@ -64,7 +62,7 @@ class Samples:
             if not np.all(np.isfinite(getattr(self, item.name))):
                 raise ValueError(f"{item.name} must be finite: leave such samples out")
 
-    def take(self, index: NDArray[np.intp]) -> Samples:
+    def take(self, index: IntArray) -> Samples:
         """Return the samples with these indices."""
         return Samples(self.state[index], self.nominal[index], self.nominal_control[index])
 

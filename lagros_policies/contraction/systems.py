@@ -10,13 +10,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.dynamics import System
 from lagros_policies.contraction.basis import Basis
 from lagros_policies.contraction.metric import DualMetric, Metric
-
-FloatArray = NDArray[np.float64]
 
 # Rounding of what should be zero, as a share of the metric times the reach of the control.
 _ROUNDING = 1e-9

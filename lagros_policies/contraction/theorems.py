@@ -23,9 +23,9 @@ it holds (14) does, and not the reverse.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_envs.aliases import moved_names
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_not_negative
 from lagros_envs.dynamics import System, control_matrix
 from lagros_policies.contraction.condition import Samples
@@ -33,7 +33,6 @@ from lagros_policies.contraction.control import contraction_terms
 from lagros_policies.contraction.metric import Metric, metric_place
 
 moved_names(__name__)
-FloatArray = NDArray[np.float64]
 
 
 def disturbed_rate(metric: Metric, drift: float, disturbance: float) -> float:

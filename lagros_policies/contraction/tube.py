@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_above, check_at_least, check_not_negative, check_positive
 from lagros_policies.contraction.metric import ContractionMetric, extreme_eigenvalues
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,10 +25,10 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from lagros_envs.aliases import moved_names
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.checks import check_fields, check_not_negative, check_positive
 from lagros_envs.dynamics import System, control_matrix, jacobian
 from lagros_policies.contraction.cvstem import InfeasibleError
@@ -36,8 +36,6 @@ from lagros_policies.contraction.regions import BoxRegion
 from lagros_policies.contraction.semidefinite import solve_conic, svec, symmetric_basis
 
 moved_names(__name__)
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Method = Literal["paper", "output", "ellipsoid"]
 
 # Points of a box at which the condition is imposed, and those that a held control begins with.

@@ -12,9 +12,9 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float32Array = NDArray[np.float32]
+from lagros_envs.arrays import Float32Array
+
 Activation = Literal["none", "relu", "libm", "rational"]
 
 # tanh(x) = x P(x^2) / Q(x^2) for |x| <= 9, where tanh(9) is 1 to half a unit of float32; constant

@@ -14,13 +14,11 @@ from pathlib import Path
 from types import TracebackType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import Float32Array
 from lagros_policies.export.c99 import observation_call
 from lagros_policies.export.onnx import INSTALL
 from lagros_policies.export.source import Source
-
-Float32Array = NDArray[np.float32]
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 # Called with many observations, so that the time of a call from Python does not count.

@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import Float32Array
 from lagros_policies.export.check import CompiledPolicy, compiler, onnx_function
 from lagros_policies.export.source import Source
-
-Float32Array = NDArray[np.float32]
 
 # What runs anywhere.
 PLAIN = ("-std=c99", "-O2")

@@ -11,13 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lagros_envs.arrays import Float32Array
 from lagros_envs.dynamics.straight_line import StraightLine, straight_line
 from lagros_envs.numbers import functions
 
-Float32Array = NDArray[np.float32]
 Layers = Sequence[tuple[Float32Array, Float32Array]]
 Numbers = Sequence[Any]
 

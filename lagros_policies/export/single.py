@@ -7,16 +7,14 @@ from functools import partial
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import Float32Array
 from lagros_envs.numbers import functions
 from lagros_envs.task import Task
 from lagros_policies.export.program import Numbers, Part, Program
 from lagros_policies.export.source import Exported
 from lagros_policies.learning.features import See, seen
 from lagros_policies.learning.networks import Mlp
-
-Float32Array = NDArray[np.float32]
 
 
 def exported(policy: Any) -> Exported:

@@ -8,17 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lagros_envs.arrays import Float32Array
 from lagros_envs.checks import shown
 from lagros_envs.registry import find_task, task_names
 from lagros_envs.task import Described
 from lagros_policies.export.program import Program
 from lagros_policies.policy import BasePolicy
 from lagros_policies.room import found_file, imported, named_in, part_of
-
-Float32Array = NDArray[np.float32]
 
 # Policies that are one evaluation of a network.
 _POLICIES = {

@@ -15,15 +15,12 @@ import math
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
+from lagros_envs.arrays import FloatArray, IntArray
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 from lagros_policies.planning.vectors import segment_distance
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 # Cells that every agent has at least, however many agents there are.
 _FEWEST = 400

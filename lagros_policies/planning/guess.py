@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_fields, check_whole
 from lagros_envs.dynamics import vector_field
 from lagros_policies.planning.grid_path import GridSettings, shortest_paths, walk
@@ -20,7 +20,6 @@ from lagros_policies.planning.problem import Problem
 from lagros_policies.planning.scp import ScpSettings, solve_scp
 from lagros_policies.planning.trajectory import Trajectory
 
-FloatArray = NDArray[np.float64]
 Guess = tuple[FloatArray, FloatArray]
 
 # The grid's cell and border as shares of the least and the largest distance to keep.

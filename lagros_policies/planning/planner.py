@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import shown
 from lagros_envs.task import Numbers, Scenario, Task
 from lagros_policies.planning.guess import PlannerSettings, plan_trajectory
@@ -14,8 +14,6 @@ from lagros_policies.planning.problem import DISTANCE_SLACK, Discs, Problem
 from lagros_policies.planning.scp import solve_scp
 from lagros_policies.planning.trajectory import Trajectory
 from lagros_policies.room import part_of
-
-FloatArray = NDArray[np.float64]
 
 
 class Planner(Protocol):

@@ -8,8 +8,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.checks import (
     MOST_STEPS,
     check_fields,
@@ -20,8 +21,6 @@ from lagros_envs.checks import (
 )
 from lagros_envs.dynamics import System
 from lagros_policies.contraction.tube import tighten
-
-FloatArray = NDArray[np.float64]
 
 # By so much less than required a distance from a disc counts as kept [units of the position].
 DISTANCE_SLACK = 1e-6
@@ -152,7 +151,7 @@ class Problem:
             self._check_discs(self.discs)
 
     @property
-    def given_end(self) -> NDArray[np.bool_]:
+    def given_end(self) -> BoolArray:
         """Which coordinates of x_N are given, shape (n,)."""
         return ~np.isnan(self.terminal_state)
 

@@ -10,15 +10,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from lagros_envs.arrays import FloatArray, IntArray
 from lagros_policies.planning.problem import Problem
 from lagros_policies.planning.qp import UNBOUNDED, QuadraticProgram
 from lagros_policies.planning.vectors import unit_vectors
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True)

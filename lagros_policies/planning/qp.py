@@ -13,12 +13,11 @@ from typing import Any, Literal
 import clarabel  # at once: a fallback that is missing must not show in the middle of an episode
 import numpy as np
 import piqp
-from numpy.typing import NDArray
 from scipy import sparse
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_name
 
-FloatArray = NDArray[np.float64]
 QpSolver = Literal["piqp", "clarabel", "osqp"]
 
 # Bounds at least this large are taken for absent by both solvers.

@@ -18,8 +18,8 @@ import math
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_above, check_fields, check_not_negative
 from lagros_envs.dynamics import hold_step, linearise_hold
 from lagros_envs.dynamics.integrate import SUBSTEPS
@@ -28,8 +28,6 @@ from lagros_policies.planning.program import Linearisation, Programs
 from lagros_policies.planning.qp import QpSolver, solve_qp
 from lagros_policies.planning.trajectory import Trajectory
 from lagros_policies.planning.vectors import segment_distance
-
-FloatArray = NDArray[np.float64]
 
 # Shares of a step that are tried in turn where the trust region alone is slow to find a decrease.
 _SHARES = (0.5, 0.25, 0.125)

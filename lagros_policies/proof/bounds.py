@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_at_least
 from lagros_envs.dynamics import System
 from lagros_envs.numbers import Interval, Series, exact, variable
@@ -18,8 +19,6 @@ from lagros_policies.contraction.systems import check_polynomial, check_sizes
 from lagros_policies.proof.cells import grid
 from lagros_policies.proof.enclosures import NOTHING, constant, enclosed_metric, slopes
 from lagros_policies.proof.matrices import negative_definite
-
-FloatArray = NDArray[np.float64]
 
 # Above what sampling finds by this share, so that the intervals can show it.
 _ROOM = 1.01

@@ -16,13 +16,11 @@ from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.numbers import Interval
 from lagros_policies.proof.matrices import negative_definite
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Failure = TypeVar("Failure")
 FailureOut = TypeVar("FailureOut", covariant=True)
 

@@ -27,8 +27,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.dynamics import System
 from lagros_policies.contraction.condition import contraction_residual
 from lagros_policies.contraction.metric import Metric
@@ -55,8 +56,6 @@ __all__ = [
     "prove_contraction",
     "prove_hold",
 ]
-
-FloatArray = NDArray[np.float64]
 
 # Far above the rounding of a residual [1/s].
 _SURELY = 1e-6

@@ -7,15 +7,13 @@ from math import comb
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.dynamics import System
 from lagros_envs.dynamics.integrate import rk4_hold
 from lagros_envs.numbers import Dual, Interval, Series, exact, functions
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.proof.matrices import matmul, transpose
-
-FloatArray = NDArray[np.float64]
 
 # A derivative below this is that of a function which does not depend on its argument: intervals
 # add as much to a zero, and no proof of definiteness is as close.

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.checks import check_positive
 from lagros_envs.dynamics import System, linearise_hold
 from lagros_envs.numbers import Dual, Interval, Series, exact, functions, variable
@@ -35,8 +35,6 @@ from lagros_policies.proof.enclosures import (
 from lagros_policies.proof.matrices import matmul
 from lagros_policies.proof.sets import ProofSet, Triple
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 # From series at a triple to one of symmetric matrices (..., n, n).
 Matrices = Callable[[Triple], Series]
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray
 from lagros_envs.numbers import Interval
 from lagros_envs.numbers.interval import ordered
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # What rounding may add to an entry of a product of three 4 by 4 matrices, relative to the product
 # of their magnitudes: it is below 16 units, of 1.1e-16 each.

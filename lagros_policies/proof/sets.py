@@ -7,17 +7,15 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.dynamics import System
 from lagros_envs.numbers import Interval
 from lagros_policies.contraction.places import Point
 from lagros_policies.contraction.regions import BoxRegion
 from lagros_policies.contraction.systems import check_sizes
 from lagros_policies.proof.cells import mesh
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Far above the rounding of a bound of an error, relative.
 _WIDER = 1.0 + 1e-12

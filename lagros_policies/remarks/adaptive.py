@@ -28,9 +28,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_envs.aliases import moved_names
+from lagros_envs.arrays import FloatArray
 from lagros_envs.dynamics import hold_control_slope
 from lagros_policies.contraction.control import HeldControl
 from lagros_policies.contraction.metric import matrices_along, metric_place
@@ -38,7 +38,6 @@ from lagros_policies.contraction.places import along
 from lagros_policies.contraction.regions import even_coordinate
 
 moved_names(__name__)
-FloatArray = NDArray[np.float64]
 # (x (..., n), u (..., 1)) -> Y (..., k), in units of the control per unit of a.
 Regressor = Callable[[FloatArray, FloatArray], FloatArray]
 

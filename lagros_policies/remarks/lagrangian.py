@@ -24,12 +24,11 @@ import math
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_envs.aliases import moved_names
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_not_negative, check_positive, check_whole
 
-FloatArray = NDArray[np.float64]
 moved_names(__name__)
 
 # What is left of an impulse response after this many steps of the slower mode is nothing.

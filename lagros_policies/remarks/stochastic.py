@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_at_least, check_not_negative, check_positive
 from lagros_envs.dynamics import System, hold_step
 from lagros_policies.contraction.double_integrator import AxisMetric
@@ -36,8 +36,6 @@ from lagros_policies.contraction.metric import (
     metric_is_still,
 )
 from lagros_policies.contraction.places import along
-
-FloatArray = NDArray[np.float64]
 
 _GRID = 401
 # Shares of alpha that eps may take; the best of them is used.

@@ -30,15 +30,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.checks import (
     check_disturbance_bound,
     check_fields,
     check_not_negative,
     check_positive,
 )
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Closer centres have no direction [m].
 _SAME_PLACE = 1e-9

@@ -14,11 +14,8 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
+from lagros_envs.arrays import BoolArray, FloatArray, IntArray
 
 # What counts as met, relative to the largest bound of the row.
 _TOLERANCE = 1e-9

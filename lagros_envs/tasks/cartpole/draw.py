@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.canvas import (
     BLACK,
     BLUE,
@@ -29,8 +30,6 @@ from lagros_envs.draw import Frame
 
 if TYPE_CHECKING:
     from lagros_envs.tasks.cartpole.task import CartPoleSettings
-
-FloatArray = NDArray[np.float64]
 
 WIDTH, HEIGHT = 800, 400  # [px]
 RAIL_HEIGHT = 352  # of the rail, from the top [px]

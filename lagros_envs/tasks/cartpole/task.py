@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import (
     LARGEST,
     check_at_most,
@@ -23,8 +23,6 @@ from lagros_envs.task import LARGEST_CONTROL, Layout, Learning, Scenario, Task
 from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tube import PaperTube
 from lagros_envs.values import use_plain_numbers
-
-FloatArray = NDArray[np.float64]
 
 STATE_DIM = 4
 FALL_ANGLE = math.pi / 2  # [rad]

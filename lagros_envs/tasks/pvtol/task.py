@@ -8,12 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.task import Defaults, Feedback, Learning, MetricDesign, Scenario, Task
 from lagros_envs.tasks.pvtol.physics import Pvtol
-
-FloatArray = NDArray[np.float64]
 
 _TILT = math.pi / 3.0  # of plans, and their largest dphi/dt [rad, rad/s]
 _HOVER = Pvtol().hover

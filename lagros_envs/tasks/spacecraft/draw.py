@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.canvas import (
     BLACK,
     BLUE,
@@ -26,8 +27,6 @@ from lagros_envs.canvas import (
     mix,
 )
 from lagros_envs.tasks.spacecraft.world import SpacecraftWorld
-
-FloatArray = NDArray[np.float64]
 
 VIEW = 640  # side of the scene [px]
 PANEL = 200  # width of the legend beside it [px]

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.conventions import (
     Conforming,
     End,
@@ -26,8 +27,6 @@ from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset, Scenario, preset_named
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_envs.tasks.spacecraft.world import Outcome, SpacecraftWorld
-
-FloatArray = NDArray[np.float64]
 
 
 class SpacecraftEpisode:

@@ -7,10 +7,10 @@ from typing import Any, Literal, cast
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from pettingzoo.utils.env_logger import EnvLogger
 
+from lagros_envs.arrays import Float32Array, FloatArray
 from lagros_envs.conventions import (
     RENDER_MODES,
     check_render_mode,
@@ -27,8 +27,6 @@ from lagros_envs.tasks.spacecraft.episode import (
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import global_state, named_state_space, observe
 
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
 # What PettingZoo's own tests pass to the reset of any environment.
 _OF_CHECKERS = {"options": 1}
 

@@ -7,10 +7,8 @@ import sys
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from lagros_envs.arrays import BoolArray, FloatArray
 
 DRAWS = 16  # of one point or pair at a time ...
 ROUNDS = 12  # ... and how often, before the attempt is given up

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from lagros_envs.arrays import BoolArray, FloatArray
 
 # Cells times discs, each of which is looked at: a second, and a gigabyte.
 _MOST_CELLS = 50_000_000

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import (
     check_fields,
     check_not_negative,
@@ -27,9 +27,6 @@ from lagros_envs.reading import Record
 from lagros_envs.tasks.spacecraft.placement import clear, most_apart, scatter, scatter_pairs
 from lagros_envs.tasks.spacecraft.reachable import way_exists
 from lagros_envs.values import ByValue, use_plain_numbers
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 FORMAT = "lagros-scenario-1"
 ATTEMPTS = 1000  # of a whole scenario, before the density is called impossible

@@ -10,14 +10,11 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import Float32Array, FloatArray, IntArray
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.task import STATE_DIM, SpacecraftSettings
 from lagros_envs.tasks.spacecraft.world import SpacecraftWorld
-
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
 
 NEIGHBOUR_DIM = 4  # relative position and velocity
 OBSTACLE_DIM = 3  # relative position and radius
@@ -183,7 +180,7 @@ def _fill(
 
 
 @lru_cache(maxsize=8)
-def _places_of_others(worlds: int, agents: int) -> NDArray[np.intp]:
+def _places_of_others(worlds: int, agents: int) -> IntArray:
     """Return where in (worlds * agents,) the others of each agent are, (others, worlds, agents)."""
     own = np.arange(agents)
     index = np.arange(agents - 1)[:, None]

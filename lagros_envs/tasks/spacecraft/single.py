@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal, cast
 
 import gymnasium as gym
-import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import Float32Array, FloatArray
 from lagros_envs.conventions import RENDER_MODES, check_render_mode
 from lagros_envs.options import checked_actions, real_numbers
 from lagros_envs.tasks.spacecraft import task
@@ -21,9 +20,6 @@ from lagros_envs.tasks.spacecraft.episode import (
 )
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import observe
-
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
 
 
 class SpacecraftEnv(OneWorld, gym.Env[Float32Array, Float32Array]):

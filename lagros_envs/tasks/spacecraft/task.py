@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.checks import (
     LARGEST,
     MOST_STEPS,
@@ -27,9 +27,6 @@ from lagros_envs.tasks.spacecraft.physics import Spacecraft
 from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS
 from lagros_envs.tube import PaperTube
 from lagros_envs.values import use_plain_numbers
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 STATE_DIM = 6
 THRUSTERS = 8
@@ -146,7 +143,7 @@ def nominal_from_options(
     options: dict[str, Any],
     settings: SpacecraftSettings,
     batch: tuple[int, ...],
-    looked_at: NDArray[np.bool_] | None = None,
+    looked_at: BoolArray | None = None,
 ) -> FloatArray | None:
     """Return x_d of every agent at every control instant, if the options hold it.
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from lagros_envs.autoreset import RestartingVectorEnv, nominal_after
 from lagros_envs.checks import check_whole
 from lagros_envs.conventions import check_started
@@ -24,11 +23,6 @@ from lagros_envs.tasks.spacecraft.sensing import (
     observation_columns,
     observe,
 )
-
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
 
 
 class SpacecraftVectorEnv(RestartingVectorEnv):

@@ -6,17 +6,13 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray, IntArray
 from lagros_envs.disturbances import Disturbance, Situation
 from lagros_envs.dynamics.held import HeldBatch
 from lagros_envs.sweep import Path, swept_agents, swept_obstacles
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
 
 # With 2 substeps of 0.05 s, halving the substep moves no state of a 45 s episode by 1e-4 while
 # the body turns slower than 5 rad/s.

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_policies.planning.joint.scp import positions_between
 from lagros_policies.planning.vectors import segment_distance
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray, IntArray
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 from lagros_policies.planning.grid_path import (
     GridSettings,
@@ -22,9 +22,6 @@ from lagros_policies.planning.joint.plan import JointPlan, divisor, instants, sw
 from lagros_policies.planning.joint.problem import JointProblem, JointScpSettings
 from lagros_policies.planning.joint.scp import JointSolution, positions_between, solve_joint
 from lagros_policies.planning.joint.search import search_in_turn
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 # Distances are planned wider by this, so that a swept check finds the margins themselves kept [m].
 _SPARE = 5e-3

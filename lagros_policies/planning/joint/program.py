@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from lagros_envs.arrays import FloatArray, IntArray
 from lagros_policies.planning.joint.problem import JointProblem, JointScpSettings
 from lagros_policies.planning.qp import UNBOUNDED, QuadraticProgram
 from lagros_policies.planning.vectors import unit_vectors
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 # Entries of some equalities by row, column and value, and their right sides.
 Equalities = tuple[list[tuple[IntArray, IntArray, FloatArray]], FloatArray]
 

@@ -18,8 +18,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_policies.planning.joint.problem import (
     JointProblem,
     JointScpSettings,
@@ -27,8 +27,6 @@ from lagros_policies.planning.joint.problem import (
 )
 from lagros_policies.planning.joint.program import ProgramLayout
 from lagros_policies.planning.qp import solve_qp
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

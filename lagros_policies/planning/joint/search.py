@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray, IntArray
 from lagros_policies.planning.grid_path import STEPS, Frame, GridSettings, frames_around
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 
 def search_in_turn(

@@ -11,14 +11,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_policies.planning.grid_path import straighten
 from lagros_policies.planning.vectors import segment_distance
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Corners of the polygon around a disc, and how far outside the corners' circle they stand.
 _CORNERS = 10

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from lagros_envs.arrays import FloatArray
 
 # Two centres nearer than this are one obstacle [m]: bodies that overlap so far are none.
 _SAME_OBSTACLE = 0.05

@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_policies.planning.vectors import lengths
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-
 
 # Distances are planned wider by this, so that they are kept between the instants too [m].
 _SPARE = 0.01

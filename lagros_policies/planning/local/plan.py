@@ -21,13 +21,11 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_policies.planning.local.motion import Discs, LocalPlan, required_distances
 from lagros_policies.planning.local.problem import LocalPlannerSettings, LocalProblem
 from lagros_policies.planning.vectors import lengths
-
-FloatArray = NDArray[np.float64]
 
 # Instants at which a plan in force is checked are at most this far apart [s].
 _CHECK_SPACING = 0.4

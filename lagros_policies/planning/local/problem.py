@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import piqp
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
 from lagros_policies.planning.grid_path import walk
 from lagros_policies.planning.local.guess import pass_aside, progress, way_around
@@ -20,9 +20,6 @@ from lagros_policies.planning.local.motion import (
     responses,
 )
 from lagros_policies.planning.vectors import lengths, unit_vectors
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _UNBOUNDED = 1e30
 # Instants where distances are imposed: at most this far apart, near and far ahead [s].

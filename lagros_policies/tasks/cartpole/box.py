@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.checks import check_fields, check_not_negative
 from lagros_envs.dynamics import System
 from lagros_envs.numbers import Interval, exact, functions
@@ -18,9 +18,6 @@ from lagros_policies.contraction.places import Point
 from lagros_policies.proof.sets import ProofSet, Triple, boxed
 from lagros_policies.tasks.cartpole.region import Region
 from lagros_policies.tasks.cartpole.systems import check_cartpole
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

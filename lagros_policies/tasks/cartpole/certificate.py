@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY, CartPole
 from lagros_policies.contraction.certificate import Certificate, Stopwatch, TubeSizes
@@ -32,8 +31,6 @@ from lagros_policies.tasks.cartpole.box import ProofBox
 from lagros_policies.tasks.cartpole.lipschitz import lipschitz_constant
 from lagros_policies.tasks.cartpole.proof import angle_box
 from lagros_policies.tasks.cartpole.systems import check_cartpole, check_cartpole_metric
-
-FloatArray = NDArray[np.float64]
 
 # States at which the feasibility of u* is checked besides its proof.
 _CHECKS = 10_000

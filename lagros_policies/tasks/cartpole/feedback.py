@@ -14,15 +14,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray, IntArray
 from lagros_envs.checks import check_fields, check_whole
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tube import PaperTube
 from lagros_policies.contraction.feedback import riccati_gains
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 # The published tube begins with radius zero; errors are measured against at least its radius
 # after one step.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_fields, check_seed, check_whole
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.tasks.cartpole import task
@@ -21,8 +21,6 @@ from lagros_policies.contraction import (
 from lagros_policies.contraction.regions import joined
 from lagros_policies.tasks.cartpole.planner import CartPolePlanner
 from lagros_policies.tasks.cartpole.region import Region
-
-FloatArray = NDArray[np.float64]
 
 # Namespaces of episodes: the design, the check and the training data never share one.
 _DESIGN = 1

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_fields, check_positive
 from lagros_envs.tasks.cartpole.physics import ANGLE
 from lagros_envs.tasks.cartpole.task import FALL_ANGLE, STATE_DIM, CartPoleSettings
@@ -15,8 +15,6 @@ from lagros_policies.planning.planner import check_states, steps_left
 from lagros_policies.planning.problem import Problem
 from lagros_policies.planning.scp import ScpSettings, solve_scp
 from lagros_policies.planning.trajectory import Trajectory
-
-FloatArray = NDArray[np.float64]
 
 # By so much a solver may exceed the force limit [N].
 FORCE_SLACK = 1e-6

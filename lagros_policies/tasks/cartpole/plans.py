@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.checks import check_fields, check_not_negative
 from lagros_envs.dynamics import System, control_matrix, jacobian
 from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.tasks.cartpole.box import ProofBox
 from lagros_policies.tasks.cartpole.systems import check_cartpole
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Angles of x at which the condition is imposed; it is even in the state, so half of them do. For a
 # held control, likewise, and those of y around each.

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev, polynomial
-from numpy.typing import NDArray
 from scipy import sparse
 
+from lagros_envs.arrays import FloatArray, IntArray
 from lagros_envs.checks import check_fields
 from lagros_envs.dynamics import control_matrix, jacobian, linearise_hold
 from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY, CartPole
@@ -35,8 +35,6 @@ from lagros_policies.tasks.cartpole.box import ProofBox
 from lagros_policies.tasks.cartpole.proof import PROVED_BOX, angle_box
 from lagros_policies.tasks.cartpole.region import Region
 from lagros_policies.tasks.cartpole.systems import check_cartpole
-
-FloatArray = NDArray[np.float64]
 
 # Angles at which I <= W_bar <= chi I is imposed.
 _BOUND_ANGLES = 25
@@ -157,7 +155,7 @@ def design_on_points(
     )
 
 
-def _failing(worst: FloatArray) -> NDArray[np.intp]:
+def _failing(worst: FloatArray) -> IntArray:
     order = np.argsort(worst)[::-1]
     return order[: min(_ADDED, int(np.sum(worst > 0.0)))]
 

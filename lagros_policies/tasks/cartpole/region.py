@@ -7,14 +7,11 @@ from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.checks import check_positive
 from lagros_envs.tasks.cartpole.physics import ANGLE
 from lagros_policies.contraction.regions import BoxRegion, Samples
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _STATES = 4  # [p, theta, dp/dt, dtheta/dt]
 

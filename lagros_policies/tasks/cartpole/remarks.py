@@ -16,9 +16,9 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_envs.aliases import moved_names
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.conventions import settings_of
 from lagros_envs.dynamics import System, vector_field
 from lagros_envs.tasks.cartpole import task
@@ -35,8 +35,6 @@ from lagros_policies.tasks.cartpole.neural.metric import load_neural_metric
 from lagros_policies.tasks.cartpole.systems import check_cartpole
 from lagros_policies.tube_mpc import TubeMpcPolicy, TubeMpcState, check_own_metric
 
-Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
 moved_names(__name__)
 
 # What the adaptation is prepared for: |dp/dt| [m/s] and |d2p/dt2| [m/s^2] of the cart, and how far
@@ -172,7 +170,7 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
         self,
         observation: Float32Array,
         state: PolicyState = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Plan, learn and track; see `Policy.predict`. The state is one per row."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.checks import check_instance
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN
@@ -25,9 +25,6 @@ from lagros_policies.tasks.spacecraft.setup import (
     write_plan,
 )
 from lagros_policies.tasks.spacecraft.wrench_control import WrenchTracking
-
-Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
 
 # Time from node to node of a plan [s].
 _NODE_PERIOD = 0.5
@@ -166,7 +163,7 @@ class CentralizedPolicy(BasePolicy):
         self,
         observation: Float32Array,
         state: PolicyState = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Plan at the start, then track; see `Policy.predict`.

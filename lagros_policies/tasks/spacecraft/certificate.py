@@ -6,8 +6,8 @@ import math
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.tasks.spacecraft.physics import Spacecraft, check_spacecraft
 from lagros_policies.contraction.certificate import Certificate, Stopwatch, TubeSizes
 from lagros_policies.contraction.double_integrator import (
@@ -29,8 +29,6 @@ from lagros_policies.tasks.spacecraft.proof import (
     prove_axis,
     prove_spacecraft,
 )
-
-FloatArray = NDArray[np.float64]
 
 _AXES = 3
 # Far above the rounding of an eigenvalue, and what the proof of an axis gives up of the rate.

@@ -7,8 +7,8 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.checks import check_instance, check_not_negative, check_whole
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
@@ -28,9 +28,6 @@ from lagros_policies.tasks.spacecraft.setup import (
     task_and_preset,
 )
 from lagros_policies.tasks.spacecraft.wrench_control import WrenchTracking
-
-Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
 
 # A neighbour slower than this [m/s] is taken to rest, plus this for each unit of the bound: what is
 # left of the disturbance in a smoothed velocity.
@@ -158,7 +155,7 @@ class DistributedTubeMpcPolicy(BasePolicy):
         self,
         observation: Float32Array,
         state: PolicyState = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Plan if it is time, and track; see `Policy.predict`.

@@ -23,12 +23,10 @@ from fractions import Fraction
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_positive
 from lagros_policies.contraction.double_integrator import flow
-
-FloatArray = NDArray[np.float64]
 
 # W is enlarged by this share, so that the exact proof has room for its rounding.
 _ROOM = 1e-9

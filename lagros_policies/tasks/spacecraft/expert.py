@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_fields, check_positive
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_envs.tasks.spacecraft.task import STATE_DIM, SpacecraftSettings
@@ -21,8 +21,6 @@ from lagros_policies.tasks.spacecraft.centralized import planner_settings
 from lagros_policies.tasks.spacecraft.pace import time_to_go
 from lagros_policies.tasks.spacecraft.setup import PLANE, write_plan
 from lagros_policies.tasks.spacecraft.wrench_control import WrenchTracking
-
-FloatArray = NDArray[np.float64]
 
 # Beyond this the grid of the planner's guesses would grow without end [m].
 SEARCH_RADIUS = 15.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import Float32Array, FloatArray
 from lagros_envs.tasks.spacecraft.sensing import NEIGHBOUR_DIM, OBSTACLE_DIM
 from lagros_envs.tasks.spacecraft.task import THRUSTERS
 from lagros_policies.export.program import Bodies, Numbers, Part, Program, Vector
@@ -14,9 +14,6 @@ from lagros_policies.export.source import Exported, Source
 from lagros_policies.tasks.spacecraft.features import NEIGHBOUR, body_features, own_features
 from lagros_policies.tasks.spacecraft.network_policy import SpacecraftNetworkPolicy
 from lagros_policies.tasks.spacecraft.thrusters import allocation_matrix
-
-Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
 
 SpacecraftSource = Source  # its older name
 _OWN = Part(

@@ -12,18 +12,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import ComplexArray, Float32Array, FloatArray
 from lagros_envs.numbers.functions import exp, maximum, minimum
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.learning.deep_set import Elements, SetFeatures
 from lagros_policies.tasks.spacecraft.pace import time_to_go
 from lagros_policies.tasks.spacecraft.sensed import Sensed
-
-Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-BoolArray = NDArray[np.bool_]
 
 OWN = (
     "distance to the goal [m]",

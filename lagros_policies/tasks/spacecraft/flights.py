@@ -15,8 +15,8 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import Float32Array, IntArray
 from lagros_envs.checks import (
     check_above,
     check_disturbance_bound,
@@ -38,9 +38,6 @@ from lagros_policies.tasks.spacecraft.expert import SpacecraftExpert, Spacecraft
 from lagros_policies.tasks.spacecraft.features import spacecraft_features
 from lagros_policies.tasks.spacecraft.network_policy import SpacecraftNetworkPolicy
 from lagros_policies.tasks.spacecraft.sensed import Sensed
-
-Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import Layout
@@ -26,9 +26,6 @@ from lagros_policies.tasks.spacecraft.setup import (
 )
 from lagros_policies.tasks.spacecraft.thrusters import allocate
 from lagros_policies.trained_for import check_trained_for
-
-Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
 
 
 class SpacecraftActor(BasePolicy):
@@ -115,7 +112,7 @@ class SpacecraftNetworkPolicy(SpacecraftActor):
         self,
         observation: Float32Array,
         state: PolicyState = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Evaluate the network for one agent (o,) or many (B, o); see `Policy.predict`."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, ComplexArray, Float32Array, FloatArray
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.learning.networks import Mlp
@@ -14,11 +15,6 @@ from lagros_policies.policy import PolicyState
 from lagros_policies.tasks.spacecraft.network_policy import SpacecraftActor
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.thrusters import allocate
-
-Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-BoolArray = NDArray[np.bool_]
 
 NEAREST = 3  # neighbours, and obstacles, that the agent looks at
 WRENCH = 3  # what it chooses: a force and a torque
@@ -171,7 +167,7 @@ class SpacecraftPpoPolicy(SpacecraftActor):
         self,
         observation: Float32Array,
         state: PolicyState = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Choose the mean thrusts of one agent (o,) or of many (B, o); see `Policy.predict`."""

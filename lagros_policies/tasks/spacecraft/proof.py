@@ -18,14 +18,10 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lagros_envs.arrays import FloatArray
 from lagros_envs.tasks.spacecraft.physics import HEADING, VELOCITY_X, Spacecraft, check_spacecraft
 from lagros_policies.contraction.double_integrator import AxisMetric
 from lagros_policies.contraction.statement import Statement, at_most
-
-FloatArray = NDArray[np.float64]
 
 # The condition of an optimal metric is an equality, which rounding may miss by one unit in the last
 # place; it is proved for a rate that is less by this share.

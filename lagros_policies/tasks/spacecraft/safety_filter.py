@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from lagros_envs.checks import check_instance
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
@@ -27,10 +28,7 @@ from lagros_policies.tasks.spacecraft.sensed import Sensed, WorldState
 from lagros_policies.tasks.spacecraft.setup import task_and_preset
 from lagros_policies.tasks.spacecraft.thrusters import allocate, to_body
 
-Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
+Counts = NDArray[np.int64]
 
 COUNTERS = ("filtered_steps", "interventions", "infeasible")
 # A violation below this is rounding [m/s^2].
@@ -53,7 +51,7 @@ class FilterState(NamedTuple):
     """
 
     inner: PolicyState
-    counts: IntArray
+    counts: Counts
 
 
 class SafetyFilter(BasePolicy):
@@ -114,7 +112,7 @@ class SafetyFilter(BasePolicy):
         self,
         observation: Float32Array,
         state: PolicyState = None,
-        episode_start: NDArray[np.bool_] | None = None,
+        episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
         """Ask the inner policy and filter its actions; see `Policy.predict`.
@@ -228,7 +226,7 @@ class SafetyFilter(BasePolicy):
         return torque, most / body.mass
 
     def _sidestep(
-        self, rows: NDArray[np.intp], worst: NDArray[np.intp], planes: HalfPlanes, sensed: Sensed
+        self, rows: IntArray, worst: IntArray, planes: HalfPlanes, sensed: Sensed
     ) -> FloatArray:
         """Return what to add to the acceleration of agents that are blocked, (B, 2) [m/s^2].
 
@@ -261,8 +259,8 @@ class SafetyFilter(BasePolicy):
         return push
 
     def _remembered(
-        self, state: PolicyState, count: int, episode_start: NDArray[np.bool_] | None
-    ) -> tuple[PolicyState, IntArray]:
+        self, state: PolicyState, count: int, episode_start: BoolArray | None
+    ) -> tuple[PolicyState, Counts]:
         """Return the inner state and the counts so far, which start anew with an episode."""
         if state is None:
             return None, np.zeros((count, len(COUNTERS)), np.int64)

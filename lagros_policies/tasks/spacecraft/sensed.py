@@ -7,14 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN, VELOCITY_X
 from lagros_envs.tasks.spacecraft.sensing import NEIGHBOUR_DIM, OBSTACLE_DIM, Layout
 from lagros_envs.tasks.spacecraft.task import STATE_DIM
 from lagros_policies.observed import as_numbers
 from lagros_policies.tasks.spacecraft.setup import PLANE
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 class Sensed(NamedTuple):

@@ -6,9 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lagros_envs.arrays import FloatArray
 from lagros_envs.conventions import settings_of
 from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN
 from lagros_envs.tasks.spacecraft.scenarios import Preset, preset_named
@@ -19,8 +17,6 @@ from lagros_policies.trained_for import Range, body_values
 
 if TYPE_CHECKING:
     from lagros_policies.planning.joint.plan import JointPlan
-
-FloatArray = NDArray[np.float64]
 
 # Position and velocity in the state: plans lie in the plane, at a heading that rests.
 PLANE = [0, 1, 3, 4]

@@ -15,11 +15,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN, Spacecraft, check_spacecraft
-
-FloatArray = NDArray[np.float64]
 
 # The pairs, as (positive, negative) thrusters of the signed ones; see `Spacecraft.wrench`.
 _POSITIVE = (5, 4, 7, 6)

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_positive
 from lagros_envs.tasks.spacecraft.physics import Spacecraft, check_spacecraft
 from lagros_policies.contraction.double_integrator import (
@@ -27,7 +27,6 @@ from lagros_policies.contraction.double_integrator import (
 )
 from lagros_policies.tasks.spacecraft.thrusters import held_thrust
 
-FloatArray = NDArray[np.float64]
 # Position and velocity errors (..., a) to the deviation (..., a) from the nominal acceleration.
 Law = Callable[[FloatArray, FloatArray], FloatArray]
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_at_least
 from lagros_envs.dynamics import System
 from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE
@@ -28,8 +28,6 @@ from lagros_policies.contraction.systems import check_sizes
 from lagros_policies.tasks.cartpole.neural.metric import SIZE
 from lagros_policies.tasks.cartpole.region import Region
 from lagros_policies.tasks.cartpole.systems import check_cartpole
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

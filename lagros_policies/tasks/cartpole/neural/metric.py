@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_positive
 from lagros_envs.reading import Record, named, parse_json
 from lagros_envs.tasks.cartpole.physics import ANGLE
@@ -33,8 +33,6 @@ from lagros_policies.contraction.metric_files import design_arguments, design_re
 from lagros_policies.contraction.places import along
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.tasks.cartpole.region import Region
-
-FloatArray = NDArray[np.float64]
 
 SIZE = 4
 OUTPUTS = SIZE * (SIZE + 1) // 2

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray, IntArray
 from lagros_envs.checks import (
     check_each,
     check_fields,
@@ -31,8 +31,6 @@ from lagros_policies.tasks.cartpole.neural.metric import (
 )
 from lagros_policies.tasks.cartpole.region import Region
 from lagros_policies.tasks.cartpole.systems import check_cartpole
-
-FloatArray = NDArray[np.float64]
 
 _CHECK_ANGLES = 1001
 _ROWS, _COLUMNS = np.tril_indices(SIZE)
@@ -235,7 +233,7 @@ class _Trainer:
         value = self.torch.tensor(feature(angle, self.region))[:, None]
         return value, self.torch.zeros_like(value)
 
-    def _excess(self, index: NDArray[np.intp]) -> Any:
+    def _excess(self, index: IntArray) -> Any:
         """Return the residual of the condition in the units of `contraction_residual` [1/s]."""
         torch = self.torch
         factor, rate = self._factor(self._value[index], self._change[index])
