@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,8 @@ from lagros_envs.dynamics.check import check_system
 from lagros_envs.dynamics.straight_line import recorded_measure
 from lagros_envs.numbers import functions
 from lagros_envs.rules import StepRules
-from lagros_envs.task import MetricDesign, Scenario, Task
+from lagros_envs.task import Defaults, Feedback, Learning, MetricDesign, Scenario, Task
+from lagros_envs.tasks import SHIPPED
 
 _SAMPLES = 8  # scenarios that are tried
 _AROUND = 0.05  # states beside them, as a share of the scale of each coordinate
@@ -108,6 +110,7 @@ def _check_shapes(task: Task) -> None:
         _numbers(name, getattr(task, name), n, "state")
     for name in ("rates", "position", "short_goal"):
         _indices(name, getattr(task, name), n)
+    _check_parts(task)
     if task.metric is not None:
         _check_metric(task.metric, n, m)
     if task.feedback is not None:
@@ -115,8 +118,26 @@ def _check_shapes(task: Task) -> None:
         _numbers("feedback.control_weights", task.feedback.control_weights, m, "control", False)
 
 
+def _check_parts(task: Task) -> None:
+    kinds: dict[str, tuple[type, ...]] = {
+        "metric": (MetricDesign,),
+        "feedback": (Feedback,),
+        "learning": (Learning,),
+        "weights": (Path, str),
+    }
+    for name, kind in kinds.items():
+        value = getattr(task, name)
+        if value is not None:
+            check_instance(name, value, *kind, otherwise="or None")
+    check_instance("defaults", task.defaults, Defaults)
+    if task.room is not None and task.name not in SHIPPED:
+        raise ValueError(
+            f"room={task.room!r} is a folder of this package, for the task of that name alone: set "
+            "room = None, and the general parts serve it"
+        )
+
+
 def _check_metric(metric: MetricDesign, n: int, m: int) -> None:
-    check_instance("metric", metric, MetricDesign)
     for name in ("low", "high", "error"):
         _numbers(f"metric.{name}", getattr(metric, name), n, "state", False)
     for name in ("control_low", "control_high"):

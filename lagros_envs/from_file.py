@@ -38,7 +38,7 @@ def imported(path: Path) -> ModuleType:
         del sys.modules[name]
     try:
         module = importlib.import_module(name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         line = _line_of(error, path)
         raise ValueError(
             f"{path}{line and f', line {line}'}: {type(error).__name__}: {error}"
@@ -47,7 +47,7 @@ def imported(path: Path) -> ModuleType:
     return module
 
 
-def _line_of(error: Exception, path: Path) -> int | None:
+def _line_of(error: BaseException, path: Path) -> int | None:
     """Return the last line of the file on the way to an error."""
     line = error.lineno if isinstance(error, SyntaxError) else None
     trace = error.__traceback__

@@ -162,7 +162,7 @@ def _class_of(task: Described) -> tuple[str, str]:
 
 
 def _registered(task: Described) -> Described:
-    if task.name in _FOUND and _FOUND[task.name] is task:
+    if _FOUND.get(getattr(task, "name", "")) is task:
         return task
     return register_task(task) if isinstance(task, Task) else task
 
@@ -179,6 +179,8 @@ def _loaded(text: str) -> Any:
             f"{text}: {error}. A module is looked for on Python's path; name a file by its path, "
             'such as "./car.py"'
         ) from error
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"{text}: {name} raises {type(error).__name__}: {error}") from error
     return found
 
 
@@ -187,7 +189,7 @@ def _made(found: Any, text: str) -> Described:
     if (isinstance(found, type) and issubclass(found, Described)) or callable(found):
         try:
             found = found()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise ValueError(
                 f"{text}: {getattr(found, '__name__', shown(found))}() makes no task: "
                 f"{type(error).__name__}: {error}"

@@ -50,16 +50,25 @@ def new_layers(widths: Sequence[int], alike: Alike | None) -> list[torch.nn.Line
 
     if alike is None:
         return [torch.nn.Linear(*pair) for pair in itertools.pairwise(widths)]
-    if len(widths) < _OWN + 3:
-        raise ValueError(
-            f"hidden={tuple(widths[1:-1])} must be {_OWN + 1} layers or more: the first {_OWN} are "
-            "for each disc"
-        )
+    check_widths(widths[1:-1], alike)
     rest = widths[0] - alike.things * alike.size
     shapes = [(rest + alike.size, widths[1]), (rest, widths[1])]
     shapes += [(widths[1], widths[2])] * 2
     shapes += [(2 * widths[2], widths[3]), *itertools.pairwise(widths[3:])]
     return [torch.nn.Linear(*shape) for shape in shapes]
+
+
+def check_widths(hidden: Sequence[int], alike: Alike | None) -> None:
+    """Check that there are hidden layers enough for the things that are alike.
+
+    Raises:
+        ValueError: There are too few.
+    """
+    if alike is not None and len(hidden) <= _OWN:
+        raise ValueError(
+            f"hidden={tuple(hidden)} must be {_OWN + 1} layers or more: the first {_OWN} are for "
+            "each disc"
+        )
 
 
 def outputs_of(

@@ -122,6 +122,8 @@ def test_what_is_no_task_is_said_with_a_remedy(text, message):
             "has several tasks, Puck, Other; say which",
         ),
         ("\n\n1 / 0\n", r"own.py, line \d+: ZeroDivisionError"),
+        ("\n\nraise SystemExit(3)\n", r"own.py, line \d+: SystemExit: 3"),
+        ("\n\nclass Other(Puck):\n    name = None\n\n\ntask = Other()\n", "name=None must be set"),
         ("\n\ndef broken(\n", r"own.py, line \d+: SyntaxError"),
         ("\n\nimport no_such_module\n", r"own.py, line \d+: ModuleNotFoundError"),
         ("\n\ndel Puck\n", "own.py has no task: define a subclass of lagros_envs.Task"),
@@ -185,6 +187,7 @@ class Mutable:
 
 
 FAULTS = {
+    "no name": ({"name": None}, "name=None must be set to a text like 'car'"),
     "name": ({"name": "My puck"}, "name='My puck' must be set to a text like 'car'"),
     "title": ({"title": "puck"}, "title='puck' must be set to a text like 'Car'"),
     "unit": ({"state_names": ("x", "y", "vx", "vy")}, r"a name and its unit in brackets"),
@@ -213,6 +216,10 @@ FAULTS = {
         {"goal_distance": lambda self, x, g, f: float(np.hypot(x[0] - g[0], x[1] - g[1]))},
         "cannot be recorded",
     ),
+    "defaults": ({"defaults": {"bound": 0.3}}, "defaults={'bound': 0.3} must be a Defaults"),
+    "learning": ({"learning": 3}, "learning=3 must be a Learning, or None"),
+    "weights": ({"weights": 3}, "weights=3 must be a Path or a str, or None"),
+    "folder": ({"room": "puck"}, "room='puck' is a folder of this package"),
     "radius": ({"success_radius": lambda self, time: -1.0}, r"success_radius\(0\) is -1.0"),
 }
 

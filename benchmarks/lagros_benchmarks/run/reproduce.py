@@ -29,6 +29,7 @@ from lagros_policies.backends import LOKY, Backend
 from lagros_policies.contraction import Metric, load_metric, save_metric
 from lagros_policies.learning.dataset import ExpertData, ExpertDataSettings, generate
 from lagros_policies.learning.features import seen, view_of
+from lagros_policies.learning.layers import check_widths
 from lagros_policies.learning.metric import metric_settings
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.learning.train import TrainingSettings, fit, learning_error
@@ -111,6 +112,9 @@ class ReproduceSettings:
         for name, value in said.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
+        for training in (self.between, self.lagros, self.learned):
+            assert training is not None
+            check_widths(training.hidden, view_of(task).alike)
         self.benchmark(None)
 
     @property
