@@ -1,0 +1,66 @@
+"""The metrics and networks that come with the planar quadrotor and with the car of the examples."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lagros_envs import find_task
+from lagros_envs.disturbances import OPEN_LOOP
+from lagros_envs.seeding import episode_seeds, episode_streams
+from lagros_policies.contraction import load_metric, search_violation
+from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.learned import LearnedPolicy
+from lagros_policies.learning.rounds import flown, padded_discs
+from lagros_policies.room import shipped_file
+
+CAR = str(Path(__file__).parents[2] / "examples" / "car.py")
+TASKS = ["pvtol", CAR]
+NAMES = ["pvtol", "car"]
+_TEST = 17  # namespace of episodes that were neither trained on nor published
+
+
+@pytest.fixture(params=TASKS, ids=NAMES)
+def task(request):
+    return find_task(request.param)
+
+
+def test_metric_is_what_the_task_describes_and_holds_where_it_says(task):
+    metric = load_metric(shipped_file(task, "metric.json"), task.system.state_dim)
+    assert metric.contraction_rate == task.metric.rate
+    assert metric.phi.terms == task.metric.basis
+    assert metric.point == task.metric.point
+    assert (metric.region.low, metric.region.high) == (task.metric.low, task.metric.high)
+    assert metric.verification.violations == 0
+    assert search_violation(task.system, metric, seed=5)[1] < 0.0
+
+
+@pytest.mark.parametrize("policy", [LagrosPolicy, LearnedPolicy])
+def test_networks_belong_to_the_task_and_to_their_policy(task, policy):
+    built = policy(task)
+    path = shipped_file(task, f"{policy.name}.safetensors")
+    assert path.stat().st_size < 400_000
+    assert built.network.metadata["inputs"] == ", ".join(built.see.names)
+    record = json.loads(path.with_suffix(".json").read_text())
+    assert record["policy"] == policy.name
+    assert record["learning_error"]["kind"] == "observed"
+    with pytest.raises(ValueError, match="was made for"):
+        policy(type(task)(time_limit=2.0 * task.time_limit))
+
+
+def test_one_evaluation_flies_among_the_discs(task):
+    seeds = episode_seeds(0, 60, _TEST)
+    episodes = [task.sample(episode_streams(seed).scenario) for seed in seeds]
+    size = task.steps, task.system.state_dim, task.control_period
+    pushes = np.stack(
+        [OPEN_LOOP["uniform"].realise(episode_streams(one).disturbance, *size) for one in seeds]
+    )
+    states = flown(task, LagrosPolicy(task).network, episodes, task.defaults.bound * pushes)
+    fine = np.linspace(states[:, :-1, :2], states[:, 1:, :2], 10, axis=2)
+    discs = np.stack([padded_discs(task, episode) for episode in episodes])[:, None, None]
+    gaps = np.linalg.norm(fine[..., None, :] - discs[..., :2], axis=-1) - discs[..., 2]
+    hit = ((gaps < task.body_radius) & (discs[..., 2] > 0.0)).any(axis=(1, 2, 3))
+    goals = np.stack([episode.goal[:2] for episode in episodes])
+    near = np.linalg.norm(states[:, 1:, :2] - goals[:, None], axis=-1).min(axis=1)
+    assert np.mean(~hit & (near <= task.goal_radius)) >= 0.8
