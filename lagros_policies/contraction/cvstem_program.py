@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import sparse
 
 from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
@@ -26,7 +25,6 @@ from lagros_policies.contraction.metric import default_basis
 from lagros_policies.contraction.places import Point
 from lagros_policies.contraction.regions import MetricRegion, Samples, even_coordinate
 from lagros_policies.contraction.semidefinite import (
-    ConeProgram,
     cone_rows,
     solve_cones,
     svec,
@@ -119,17 +117,7 @@ def solve_program(
     rights = np.zeros(len(conditions)), -svec(unit).ravel(), np.zeros(len(above))
     cost = np.zeros(conditions.shape[1])
     cost[-2:] = settings.control_penalty, 1.0
-    cones = len(conditions) // len(symmetric) + 2 * len(places)
-    values, status = solve_cones(
-        ConeProgram(
-            cost,
-            sparse.csc_matrix(np.vstack([conditions, below, above])),
-            np.concatenate(rights),
-            cones,
-            places.shape[1],
-            symmetric,
-        )
-    )
+    values, status = solve_cones(cost, [conditions, below, above], rights, places.shape[1])
     asked = f"alpha={settings.contraction_rate} (margin {settings.margin})"
     if status in ("PrimalInfeasible", "AlmostPrimalInfeasible"):
         cosine = settings.phi.cosine is not None or settings.phi == CONSTANT

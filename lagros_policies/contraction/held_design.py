@@ -33,7 +33,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import sparse
 
 from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
@@ -352,8 +351,7 @@ def _solve(lifted: FloatArray, design: HeldDesign, n: int) -> tuple[FloatArray |
     effort = np.trace(basis[:, n:, n:], axis1=1, axis2=2)
     cost[:size] = design.control_penalty * design.control_unit**2 * effort
     cost[-1] = 1.0
-    rows = sparse.csc_matrix(np.vstack(blocks))
-    values, status = solve_conic(cost, rows, np.concatenate(rights), cones)
+    values, status = solve_conic(cost, blocks, rights, cones)
     if values is None:
         return None, status
     return np.einsum("kj,jab->kab", values[:-1].reshape(count, size), basis), status

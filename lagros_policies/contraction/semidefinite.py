@@ -9,34 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy import sparse
 
 from lagros_envs.arrays import FloatArray
-
-
-@dataclass(frozen=True)
-class ConeProgram:
-    """min cost'z subject to right - rows z in a product of semidefinite cones, all of size n.
-
-    Attributes:
-        cost: Shape (z,).
-        rows: Shape (cones n(n+1)/2, z).
-        right: Shape (cones n(n+1)/2,).
-        cones: Number of cones.
-        n: Size of the matrix of each.
-        symmetric: `symmetric_basis(n)`, shape (n(n+1)/2, n, n).
-    """
-
-    cost: FloatArray
-    rows: sparse.csc_matrix
-    right: FloatArray
-    cones: int
-    n: int
-    symmetric: FloatArray
 
 
 def symmetric_basis(n: int) -> FloatArray:
@@ -83,38 +61,34 @@ def cone_rows(
 
 
 def solve_cones(
-    program: ConeProgram, tolerance: float | None = None
+    cost: FloatArray,
+    blocks: Sequence[FloatArray],
+    rights: Sequence[FloatArray],
+    n: int,
+    tolerance: float | None = None,
 ) -> tuple[FloatArray | None, str]:
-    """Solve a program with Clarabel, in one thread.
-
-    Args:
-        program: The program.
-        tolerance: Of the gap; None for the solver's own.
-
-    Returns:
-        z, shape (z,), or None where it was not found, and the solver's status.
-    """
+    """Solve `solve_conic`'s program with semidefinite cones alone, all of n by n matrices."""
     import clarabel
 
-    cones = [clarabel.PSDTriangleConeT(program.n)] * program.cones
-    return solve_conic(program.cost, program.rows, program.right, cones, tolerance)
+    cones = sum(map(len, rights)) // (n * (n + 1) // 2)
+    return solve_conic(cost, blocks, rights, [clarabel.PSDTriangleConeT(n)] * cones, tolerance)
 
 
 def solve_conic(
     cost: FloatArray,
-    rows: sparse.csc_matrix,
-    right: FloatArray,
+    blocks: Sequence[FloatArray],
+    rights: Sequence[FloatArray],
     cones: Sequence[Any],
     tolerance: float | None = None,
 ) -> tuple[FloatArray | None, str]:
-    """Minimise cost'z subject to right - rows z in a product of cones, in one thread.
+    """Minimise cost'z subject to right - rows z in a product of cones, by Clarabel in one thread.
 
     An almost solved program counts as solved: every metric and every tube is checked afterwards.
 
     Args:
         cost: Shape (z,).
-        rows: Shape (entries of all cones, z).
-        right: Shape (entries of all cones,).
+        blocks: The rows, above each other, each of shape (r, z).
+        rights: The right side, likewise, each of shape (r,).
         cones: Clarabel's, in the order of the rows.
         tolerance: Of the gap; None for the solver's own.
 
@@ -129,6 +103,7 @@ def solve_conic(
     if tolerance is not None:
         settings.tol_gap_abs = settings.tol_gap_rel = tolerance
     quadratic = sparse.csc_matrix((cost.size, cost.size))
+    rows, right = sparse.csc_matrix(np.vstack(blocks)), np.concatenate(rights)
     answer = clarabel.DefaultSolver(quadratic, cost, rows, right, cones, settings).solve()
     status = str(answer.status)
     return (np.array(answer.x) if status in ("Solved", "AlmostSolved") else None), status

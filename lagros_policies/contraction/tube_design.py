@@ -25,7 +25,6 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
-from scipy import sparse
 
 from lagros_envs.aliases import moved_names
 from lagros_envs.arrays import BoolArray, FloatArray
@@ -387,8 +386,7 @@ def _solve(
     cost = np.zeros(size + 2)
     unit = design.disturbance_bound**2 if design.method == "ellipsoid" else 1.0
     cost[-2:] = design.control_penalty * unit, 1.0
-    rows = sparse.csc_matrix(np.vstack(blocks))
-    values, status = solve_conic(cost, rows, np.concatenate(rights), cones)
+    values, status = solve_conic(cost, blocks, rights, cones)
     if values is None:
         return None, 0.0, status
     dual = np.einsum("j,jab->ab", values[:size], basis)

@@ -6,6 +6,7 @@ by how much it is violated and by how much it is kept.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -38,24 +39,29 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class Linearisation:
-    """A trajectory, and the dynamics and discs around it, in the units of the state.
+class Point:
+    """A trajectory of an iteration, with what is known of it.
 
     Attributes:
         states: x_0 ... x_N, shape (N + 1, n).
         controls: u_0 ... u_{N-1}, shape (N, m).
         following: F(x_k, u_k), shape (N, n).
-        by_state: dF/dx, shape (N, n, n).
-        by_control: dF/du, shape (N, n, m).
-        required: Distances to keep from the discs at the nodes, shape (N + 1, k), or None.
+        required: Distances that the nodes must keep, shape (N + 1, k), or None without discs.
+        clearance: Least distance beyond what the problem requires.
+        merit: Effort plus the weighted violations.
     """
 
     states: FloatArray
     controls: FloatArray
     following: FloatArray
-    by_state: FloatArray
-    by_control: FloatArray
     required: FloatArray | None = None
+    clearance: float = math.inf
+    merit: float = math.inf
+
+    @property
+    def defect(self) -> float:
+        """Largest violation of the dynamics."""
+        return float(np.max(np.abs(self.following - self.states[1:])))
 
 
 @lru_cache(maxsize=256)
@@ -122,16 +128,19 @@ class Programs:
         states = values[self.place.states] * self.problem.state_scale
         return states, values[self.place.controls] * self.problem.control_scale
 
-    def around(self, point: Linearisation, trust_weight: float) -> QuadraticProgram:
+    def around(
+        self, point: Point, slopes: tuple[FloatArray, FloatArray], trust_weight: float
+    ) -> QuadraticProgram:
         """Return the program around a trajectory.
 
         Args:
-            point: The trajectory, linearised.
+            point: The trajectory.
+            slopes: dF/dx, shape (N, n, n), and dF/du, shape (N, n, m), along it.
             trust_weight: Weight of the squared step, in scales.
         """
         place, x_scale, u_scale = self.place, self.problem.state_scale, self.problem.control_scale
-        by_control = point.by_control * self._by_control
-        by_state = point.by_state[1:] * self._by_state
+        by_control = slopes[1] * self._by_control
+        by_state = slopes[0][1:] * self._by_state
         controls, states = point.controls / u_scale, point.states[1:] / x_scale
         entries = np.concatenate([self._ones, -by_control.ravel(), -by_state.ravel()])
         equality = sparse.csc_matrix(
@@ -150,7 +159,7 @@ class Programs:
         program = QuadraticProgram(diagonal, linear, equality, target.ravel(), low, high)
         return program if point.required is None else self._with_discs(program, point)
 
-    def _with_discs(self, program: QuadraticProgram, point: Linearisation) -> QuadraticProgram:
+    def _with_discs(self, program: QuadraticProgram, point: Point) -> QuadraticProgram:
         """Add n'p_k + violated - kept = R + n'o for the discs near each node."""
         problem, required = self.problem, point.required
         assert problem.discs is not None

@@ -24,7 +24,7 @@ from lagros_envs.checks import check_above, check_fields, check_not_negative
 from lagros_envs.dynamics import hold_step, linearise_hold
 from lagros_envs.dynamics.integrate import SUBSTEPS
 from lagros_policies.planning.problem import DISTANCE_SLACK, Problem
-from lagros_policies.planning.program import Linearisation, Programs
+from lagros_policies.planning.program import Point, Programs
 from lagros_policies.planning.qp import QpSolver, solve_qp
 from lagros_policies.planning.trajectory import Trajectory
 from lagros_policies.planning.vectors import segment_distance
@@ -86,32 +86,6 @@ class ScpSettings:
                 check_above(item.name, getattr(self, item.name), 0)
 
 
-@dataclass(frozen=True)
-class _Point:
-    """A trajectory of an iteration, with what is known of it.
-
-    Attributes:
-        states: x_0 ... x_N, shape (N + 1, n).
-        controls: u_0 ... u_{N-1}, shape (N, m).
-        following: F(x_k, u_k), shape (N, n).
-        required: Distances that the nodes must keep, shape (N + 1, k), or None without discs.
-        clearance: Least distance beyond what the problem requires.
-        merit: Effort plus the weighted violations.
-    """
-
-    states: FloatArray
-    controls: FloatArray
-    following: FloatArray
-    required: FloatArray | None
-    clearance: float
-    merit: float
-
-    @property
-    def defect(self) -> float:
-        """Largest violation of the dynamics."""
-        return float(np.max(np.abs(self.following - self.states[1:])))
-
-
 def solve_scp(
     problem: Problem,
     guess: tuple[FloatArray, FloatArray] | None = None,
@@ -159,10 +133,7 @@ class _Iteration:
         iterations = 0
         solved = closing = refused = False
         while iterations < settings.max_iterations:
-            around = Linearisation(
-                point.states, point.controls, point.following, *slopes, point.required
-            )
-            program = self.programs.around(around, weight)
+            program = self.programs.around(point, slopes, weight)
             iterations += 1
             answer = solve_qp(program, settings.qp_tolerance, settings.qp_solver)
             if not answer.solved:
@@ -230,9 +201,7 @@ class _Iteration:
         states[-1, given] = problem.terminal_state[given]
         return states, controls
 
-    def _step(
-        self, point: _Point, values: FloatArray, weight: float
-    ) -> tuple[_Point | None, float]:
+    def _step(self, point: Point, values: FloatArray, weight: float) -> tuple[Point | None, float]:
         """Return the step of a program or, where that alone lowers the merit, a share of it."""
         following, controls = self.programs.states_and_controls(values)
         states = np.vstack([point.states[:1], following])
@@ -251,14 +220,14 @@ class _Iteration:
                     return new, share
         return None, 0.0
 
-    def _length(self, point: _Point, new: _Point) -> float:
+    def _length(self, point: Point, new: Point) -> float:
         """Return how far the trajectory moves, in scales; controls count times the period."""
         problem = self.problem
         states = np.max(np.abs(new.states - point.states) / problem.state_scale)
         controls = np.max(np.abs(new.controls - point.controls) / problem.control_scale)
         return max(float(states), problem.period * float(controls))
 
-    def _slopes(self, point: _Point) -> tuple[FloatArray, FloatArray]:
+    def _slopes(self, point: Point) -> tuple[FloatArray, FloatArray]:
         _, by_state, by_control = linearise_hold(
             self.problem.system,
             point.states[:-1],
@@ -268,7 +237,7 @@ class _Iteration:
         )
         return by_state, by_control
 
-    def _point(self, states: FloatArray, controls: FloatArray) -> _Point:
+    def _point(self, states: FloatArray, controls: FloatArray) -> Point:
         """Return a trajectory with its defects, its distances and its merit (exact penalty)."""
         problem = self.problem
         required, clearance, short = None, math.inf, 0.0
@@ -289,7 +258,7 @@ class _Iteration:
         effort = ((controls - problem.reference_control) ** 2).sum() * problem.period
         effort /= problem.control_scale.max() ** 2
         merit = float(effort + self.settings.penalty * (violation + short))
-        return _Point(states, controls, following, required, clearance, merit)
+        return Point(states, controls, following, required, clearance, merit)
 
     def _flow(self, states: FloatArray, controls: FloatArray) -> list[FloatArray]:
         """Return x_k, and the states after each Runge-Kutta step of its hold, each (N, n)."""

@@ -23,7 +23,7 @@ from lagros_policies.planning import (
 from lagros_policies.planning import scp as scp_module
 from lagros_policies.planning.guess import guesses
 from lagros_policies.planning.problem import DISTANCE_SLACK
-from lagros_policies.planning.program import Linearisation, Programs
+from lagros_policies.planning.program import Point, Programs
 from lagros_policies.planning.qp import solve_qp
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "planner_in_cvxpy.py"
@@ -448,10 +448,9 @@ def test_the_program_is_the_one_written_in_cvxpy(example, draw):
     twin.solve(solver="CLARABEL")
     following = hold_step(problem.system, states[:-1], controls, problem.period)
     _, *slopes = linearise_hold(problem.system, states[:-1], controls, problem.period, 2)
-    required = problem.discs.required(problem.steps)
-    around = Linearisation(states, controls, following, *slopes, required)
+    point = Point(states, controls, following, problem.discs.required(problem.steps))
     programs = Programs(problem, penalty=1e3, reach=100.0)
-    answer = solve_qp(programs.around(around, 0.5), 1e-9)
+    answer = solve_qp(programs.around(point, slopes, 0.5), 1e-9)
     following, pushes = programs.states_and_controls(answer.values)
     assert answer.solved
     assert following == pytest.approx(x.value[1:], abs=1e-4)

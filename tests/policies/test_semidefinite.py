@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy import sparse
 
 from lagros_policies.contraction.semidefinite import (
-    ConeProgram,
     cone_rows,
     solve_cones,
     svec,
@@ -49,17 +47,14 @@ def test_rows_give_the_vector_of_the_combined_matrix():
 @pytest.mark.parametrize("n", [2, 4])
 def test_the_least_bound_of_a_matrix_is_its_largest_eigenvalue(n):
     matrix = symmetric(np.random.default_rng(2), n, n)
-    rows = sparse.csc_matrix(-svec(np.eye(n))[:, None])
-    program = ConeProgram(np.ones(1), rows, -svec(matrix), 1, n, symmetric_basis(n))
-    values, status = solve_cones(program)
+    values, status = solve_cones(np.ones(1), [-svec(np.eye(n))[:, None]], [-svec(matrix)], n)
     assert status == "Solved"
     assert values[0] == pytest.approx(np.linalg.eigvalsh(matrix)[-1], abs=1e-6)
 
 
 def test_what_has_no_solution_has_no_values():
     # x >= 1 and -x >= 1.
-    rows = sparse.csc_matrix([[-1.0], [1.0]])
-    program = ConeProgram(np.ones(1), rows, np.full(2, -1.0), 2, 1, symmetric_basis(1))
-    values, status = solve_cones(program)
+    rows = np.array([[-1.0], [1.0]])
+    values, status = solve_cones(np.ones(1), [rows], [np.full(2, -1.0)], 1)
     assert values is None
     assert "Infeasible" in status

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev, polynomial
-from scipy import sparse
 
 from lagros_envs.arrays import FloatArray, IntArray
 from lagros_envs.checks import check_fields
@@ -24,7 +23,6 @@ from lagros_policies.contraction.cvstem import CvStemSettings, InfeasibleError
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.regions import Samples
 from lagros_policies.contraction.semidefinite import (
-    ConeProgram,
     cone_rows,
     solve_cones,
     svec,
@@ -232,11 +230,8 @@ def _solve(
     rights[2] = -svec(unit).ravel()
     cost = np.zeros(columns)
     cost[-3:] = cvstem.control_penalty, 1.0, _HELD_PENALTY
-    cones = len(pool.state) + len(held.state) + 2 * _BOUND_ANGLES
-    rows = sparse.csc_matrix(np.vstack(blocks))
-    problem = ConeProgram(cost, rows, np.concatenate(rights), cones, 4, symmetric)
     # What the tolerance leaves the proofs make up for, in fewer iterations.
-    values, status = solve_cones(problem, 1e-5)
+    values, status = solve_cones(cost, blocks, rights, 4, 1e-5)
     if values is None and status in ("PrimalInfeasible", "AlmostPrimalInfeasible"):
         raise InfeasibleError(
             f"no metric of degree {settings.cvstem.degree} with alpha="
