@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from lagros_envs.arrays import Float32Array
 from lagros_envs.checks import shown
@@ -23,22 +23,25 @@ _POLICIES = {
 }
 
 
-class Exported(NamedTuple):
+@dataclass(frozen=True)
+class Exported:
     """A policy taken apart.
 
     Attributes:
         program: What its file computes.
-        answer: From observations (B, o) to controls (B, m), by NumPy.
-        examples: From a number and a seed to so many random observations (B, o).
+        answer: From observations (B, o) to controls (B, m), by NumPy: what an export must give. It
+            is `predict` in units of u and without the check that the observation is finite.
+        examples: From a number and a seed, 0 if left out, to so many random observations (B, o)
+            over the range of the task.
     """
 
     program: Program
     answer: Callable[[Float32Array], Float32Array]
-    examples: Callable[[int, int], Float32Array]
+    examples: Callable[..., Float32Array]
 
 
 @dataclass(frozen=True)
-class Source:
+class Source(Exported):
     """A policy to export.
 
     Attributes:
@@ -46,35 +49,17 @@ class Source:
         file: Name of the weights file.
         digest: SHA-256 of the weights file, hexadecimal.
         policy: The policy in NumPy.
-        exported: The policy taken apart.
     """
 
     name: str
     file: str
     digest: str
     policy: Any
-    exported: Exported
 
     @property
     def identifier(self) -> str:
         """The name as C and files have it."""
         return self.name.replace("-", "_")
-
-    @property
-    def program(self) -> Program:
-        """What the file computes."""
-        return self.exported.program
-
-    def answer(self, observation: Float32Array) -> Float32Array:
-        """Return u, shape (B, m), of observations (B, o): what an export must give.
-
-        It is `predict` in units of u and without the check that the observation is finite.
-        """
-        return self.exported.answer(observation)
-
-    def examples(self, count: int, seed: int = 0) -> Float32Array:
-        """Return random observations, shape (count, o), over the range of the task."""
-        return self.exported.examples(count, seed)
 
 
 def exported_names() -> list[str]:
@@ -123,7 +108,9 @@ def load_source(name: str, weights: Path | str | None = None, **told: Any) -> So
         weights = found_file(task, f"{short}.safetensors")
     place = named_in(task, "POLICIES", {}).get(short, _POLICIES[short])
     policy: BasePolicy = imported(place)(task, weights=weights, **told)
-    exported = part_of(task, "EXPORT", "lagros_policies.export.single:exported")(policy)
+    parts: Exported = part_of(task, "EXPORT", "lagros_policies.export.single:exported")(policy)
     path = Path(weights)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return Source(f"{short}-{task.name}", path.name, digest, policy, exported)
+    return Source(
+        **vars(parts), name=f"{short}-{task.name}", file=path.name, digest=digest, policy=policy
+    )

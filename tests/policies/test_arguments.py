@@ -31,7 +31,14 @@ def kind_of(task, name):
 
 
 def arguments(task, name):
-    return list(inspect.signature(kind_of(task, name)).parameters)
+    found = {}
+    for kind in kind_of(task, name).__mro__:
+        parameters = inspect.signature(kind).parameters.values()
+        passed_on = [one for one in parameters if one.kind is one.VAR_KEYWORD]
+        found |= dict.fromkeys(one.name for one in parameters if one not in passed_on)
+        if not passed_on:
+            break
+    return list(found)
 
 
 POLICIES = [("cartpole", name) for name in CARTPOLE]

@@ -2,6 +2,7 @@
 
 import itertools
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,6 @@ from lagros_policies.export import Source, check, load_source
 from lagros_policies.export.c99 import c_file
 from lagros_policies.export.onnx import onnx_file
 from lagros_policies.export.program import Part, Program, Vector
-from lagros_policies.export.source import Exported
 from lagros_policies.learning.features import view_of
 from lagros_policies.learning.networks import Mlp
 
@@ -130,7 +130,7 @@ def of_features(parts):
         rows[:, 2] = 0.5 + np.abs(rows[:, 2])
         return rows
 
-    return Source("own-features", "none", "0", None, Exported(program, by_numpy, examples))
+    return Source(program, by_numpy, examples, "own-features", "none", "0", None)
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_features_may_be_constant_or_the_same(answer):
         source.program.control,
     )
     rows = source.examples(3)
-    found = answer(Source("own", "", "0", None, source.exported._replace(program=program)), rows)
+    found = answer(replace(source, program=program, name="own"), rows)
     y = rows[:, 1:2]
     two, half = np.full((3, 6), 2.0), np.full((3, 1), 0.5)
     np.testing.assert_array_equal(found, np.hstack([two, *[y] * 5, half]))
@@ -182,4 +182,4 @@ def test_features_that_branch_are_refused():
         source.program.parts, branching, source.program.layers, lambda u, _: u, Part("u", 12, "")
     )
     with pytest.raises(TypeError, match="must not branch"):
-        c_file(Source("own", "none", "0", None, source.exported._replace(program=program)))
+        c_file(replace(source, program=program, name="own"))

@@ -99,7 +99,23 @@ def cartpole_certificate(
     # Without (14) nothing follows from it.
     contracts = all(line.holds for line in lines[:1])
     watch.lap()
-    box = question.box
+    box, alpha = question.box, metric.contraction_rate
+    certificate = Certificate(
+        task="cartpole",
+        policy=question.policy,
+        region=region_of(box),
+        alpha=alpha,
+        chi=math.inf,
+        nu=metric.control_weight,
+        b_bar=math.inf,
+        epsilon_l=question.learning_error,
+        d_bar=question.disturbance_bound,
+        channels="all",
+        basis=basis_of(metric),
+        coefficients=metric.coefficients,
+        tube=TubeSizes(question.paper_radius, None),
+        statements=(),
+    )
     plain = replace(metric, scaling=np.ones(system.state_dim))
     try:
         bounds = prove_bounds(system, plain, *angle_box(box.angle))
@@ -107,7 +123,7 @@ def cartpole_certificate(
         drift = metric_drift(metric, 0.0, box.angle)
     except ValueError as error:
         failed = Statement(f"W_bar is a metric on the box: {error}", "proved", False, watch.lap())
-        return _broken(metric, question, (*lines, failed))
+        return replace(certificate, statements=(*lines, failed))
     lines.append(
         Statement(
             f"I <= W_bar <= {at_most(bounds.condition, 6)} I and ||B|| <= "
@@ -117,7 +133,6 @@ def cartpole_certificate(
             watch.lap(),
         )
     )
-    alpha = metric.contraction_rate
     rate = disturbed_rate(metric, drift, question.disturbance_bound)
     channels = "all" if rate > 0.0 else "rates"
     tube = Tube(
@@ -138,18 +153,12 @@ def cartpole_certificate(
     lines.extend(
         held_statement(tube, prove_held_tube(system, tube, question.most_seconds)) for tube in held
     )
-    return Certificate(
-        task="cartpole",
-        policy=question.policy,
-        region=region_of(box),
-        alpha=alpha,
+    return replace(
+        certificate,
         chi=bounds.condition,
         nu=metric.control_weight / bounds.least,
         b_bar=bounds.control_gain,
-        epsilon_l=question.learning_error,
-        d_bar=question.disturbance_bound,
         channels=channels,
-        basis=basis_of(metric),
         coefficients=metric.coefficients / bounds.least,
         tube=TubeSizes(question.paper_radius, radius if contracts else None),
         statements=tuple(lines),
@@ -190,78 +199,78 @@ def basis_of(metric: Metric) -> str:
 
 def tube_record(tube: ConstantTube) -> dict[str, object]:
     """Return a tube of a constant metric as what JSON can hold."""
-    names = ("p", "theta", "p_dot", "theta_dot")
-    box = tube.proof_box
     return {
         "method": tube.design.method,
-        "output": None if tube.design.output is None else list(tube.design.output),
-        "alpha": tube.design.rate,
-        "d_bar": tube.design.disturbance_bound,
-        "radius": tube.steady_radius,
-        "outputs": dict(zip(names, tube.steady_outputs.tolist(), strict=True)),
-        "contained": tube.contained,
+        **_record(tube),
         "largest_d_bar": tube.largest_bound,
         "nu": tube.control_weight,
-        "plan": asdict(tube.plan),
-        "region": {name: list(ends) for name, ends in region_of(box).items()},
         "W": tube.dual.tolist(),
     }
 
 
 def held_record(tube: HeldTube) -> dict[str, object]:
     """Return a tube of a held control as what JSON can hold; `Q` are Bernstein's coefficients."""
-    names = ("p", "theta", "p_dot", "theta_dot")
-    design = tube.design
     return {
-        "output": None if design.output is None else list(design.output),
-        "alpha": design.rate,
-        "d_bar": design.disturbance_bound,
-        "hold": design.period,
-        "shorter_holds_too": design.aperiodic,
-        "radius": tube.steady_radius,
-        "outputs": dict(zip(names, tube.steady_outputs.tolist(), strict=True)),
+        **_record(tube),
+        "hold": tube.design.period,
+        "shorter_holds_too": tube.design.aperiodic,
         "deviation": tube.largest_deviation,
-        "contained": tube.contained,
-        "plan": asdict(tube.plan),
-        "region": {name: list(ends) for name, ends in region_of(tube.proof_box).items()},
         "K": tube.gain.tolist(),
         "Q": tube.duals.tolist(),
     }
 
 
+def _record(tube: ConstantTube | HeldTube) -> dict[str, object]:
+    design, names = tube.design, ("p", "theta", "p_dot", "theta_dot")
+    return {
+        "output": None if design.output is None else list(design.output),
+        "alpha": design.rate,
+        "d_bar": design.disturbance_bound,
+        "radius": tube.steady_radius,
+        "outputs": dict(zip(names, tube.steady_outputs.tolist(), strict=True)),
+        "contained": tube.contained,
+        "plan": asdict(tube.plan),
+        "region": {name: list(ends) for name, ends in region_of(tube.proof_box).items()},
+    }
+
+
 def tube_statement(tube: ConstantTube, proved: bool, seconds: float) -> Statement:
     """Return a tube of a constant metric as a line of a certificate."""
-    p, angle = tube.steady_outputs[[0, ANGLE]]
-    plan, bound = tube.plan, tube.design.disturbance_bound
-    return Statement(
-        f"{tube.design.method} tube, all disturbances up to {bound:g}, control at will, e(0) = 0: "
-        f"|theta - theta_d| <= {at_most(angle)} rad, |p - p_d| <= {at_most(p)} m, ||e|| <= "
-        f"{at_most(tube.steady_radius)}; it keeps the state in its box while |theta_d| <= "
-        f"{plan.angle:g} rad, |p_d'| <= {plan.velocity:g} m/s, |theta_d'| <= "
-        f"{plan.angular_rate:g} rad/s and |u_d| <= {plan.force:g} N",
-        "proved",
-        proved,
-        seconds,
+    text = (
+        f"{tube.design.method} tube, all disturbances up to {tube.design.disturbance_bound:g}, "
+        f"control at will, e(0) = 0: {_widths(tube)}; it keeps the state in its box while "
+        f"{_where(tube)}"
     )
+    return Statement(text, "proved", proved, seconds)
 
 
 def held_statement(tube: HeldTube, proof: HeldTubeProof) -> Statement:
     """Return a tube of a held control as a line of a certificate."""
-    p, angle = tube.steady_outputs[[0, 1]]
-    plan, design = tube.plan, tube.design
+    design = tube.design
     holds = f"holds of {SHORTEST * design.period:g} to" if design.aperiodic else "held"
-    return Statement(
+    text = (
         f"ellipsoid tube, control {holds} {design.period:g} s, at the instants and between them, "
-        f"all disturbances up to {design.disturbance_bound:g}, e(0) = 0: |theta - theta_d| "
-        f"<= {at_most(angle)} rad, |p - p_d| <= {at_most(p)} m, ||e|| <= "
-        f"{at_most(tube.steady_radius)}, |u - u_d| <= {at_most(tube.largest_deviation)} N for "
-        f"u = u_d + K e, K = {np.round(tube.gain[0], 3).tolist()} (rounded); it keeps the state in "
-        f"its box while |theta_d| <= {plan.angle:g} rad, |p_d'| <= {plan.velocity:g} m/s, "
-        f"|theta_d'| <= "
-        f"{plan.angular_rate:g} rad/s and |u_d| <= {plan.force:g} N",
-        "proved",
-        proof.proved,
-        proof.seconds,
+        f"all disturbances up to {design.disturbance_bound:g}, e(0) = 0: {_widths(tube)}, "
+        f"|u - u_d| <= {at_most(tube.largest_deviation)} N for u = u_d + K e, K = "
+        f"{np.round(tube.gain[0], 3).tolist()} (rounded); it keeps the state in its box while "
+        f"{_where(tube)}"
+    )
+    return Statement(text, "proved", proof.proved, proof.seconds)
+
+
+def _widths(tube: ConstantTube | HeldTube) -> str:
+    p, angle = tube.steady_outputs[[0, ANGLE]]
+    return (
+        f"|theta - theta_d| <= {at_most(angle)} rad, |p - p_d| <= {at_most(p)} m, ||e|| <= "
+        f"{at_most(tube.steady_radius)}"
+    )
+
+
+def _where(tube: ConstantTube | HeldTube) -> str:
+    plan = tube.plan
+    return (
+        f"|theta_d| <= {plan.angle:g} rad, |p_d'| <= {plan.velocity:g} m/s, |theta_d'| <= "
+        f"{plan.angular_rate:g} rad/s and |u_d| <= {plan.force:g} N"
     )
 
 
@@ -370,25 +379,3 @@ def draw_region(rng: np.random.Generator, box: ProofBox, count: int) -> Samples:
     state[:, 0] += 1e-3
     force = rng.uniform(-1.0, 1.0, (count, 1)) * box.force
     return Samples(state, nominal, force)
-
-
-def _broken(
-    metric: Metric, question: CartPoleQuestion, statements: tuple[Statement, ...]
-) -> Certificate:
-    """Return the certificate of a metric that could not be shown to be one."""
-    return Certificate(
-        task="cartpole",
-        policy=question.policy,
-        region=region_of(question.box),
-        alpha=metric.contraction_rate,
-        chi=math.inf,
-        nu=metric.control_weight,
-        b_bar=math.inf,
-        epsilon_l=question.learning_error,
-        d_bar=question.disturbance_bound,
-        channels="all",
-        basis=basis_of(metric),
-        coefficients=metric.coefficients,
-        tube=TubeSizes(question.paper_radius, None),
-        statements=statements,
-    )

@@ -8,11 +8,9 @@ None of them is in the tables of results, so that they are named by module and c
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -79,10 +77,8 @@ class NeuralTubeMpcPolicy(TubeMpcPolicy):
     Args:
         settings: The task.
         metric: File of `save_neural_metric`; the shipped network if left out.
-        replan_every: Control steps between plans.
-        deadline: Delta t_max, after which a plan is late [s].
-        clock: Source of the time, for tests [s].
         allow_other_settings: As in `TubeMpcPolicy`.
+        planning: As in `TubeMpcPolicy`: `replan_every`, `deadline` and `clock`.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -95,15 +91,13 @@ class NeuralTubeMpcPolicy(TubeMpcPolicy):
         self,
         settings: task.CartPoleSettings | None = None,
         metric: str | Path | None = None,
-        replan_every: int = 1,
-        deadline: float = 0.1,
-        clock: Callable[[], float] = perf_counter,
         allow_other_settings: bool = False,
+        **planning: Any,
     ) -> None:
         """Read the network and build planner and law."""
         if metric is None:
             check_own_metric(settings_of(task.CartPoleSettings(), settings), allow_other_settings)
-        super().__init__(settings, load_neural_metric(metric), replan_every, deadline, clock)
+        super().__init__(settings, load_neural_metric(metric), **planning)
 
 
 @dataclass
@@ -138,10 +132,7 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
     Args:
         settings: The task, with the system that the policy *believes* in.
         metric: The contraction metric, or its file; the shipped one if left out.
-        replan_every: Control steps between plans.
-        deadline: Delta t_max, after which a plan is late [s].
-        clock: Source of the time, for tests [s].
-        allow_other_settings: As in `TubeMpcPolicy`.
+        planning: All else that `TubeMpcPolicy` takes.
 
     Raises:
         ValueError: A number is out of range.
@@ -153,13 +144,10 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
         self,
         settings: task.CartPoleSettings | None = None,
         metric: ContractionMetric | str | Path | None = None,
-        replan_every: int = 1,
-        deadline: float = 0.1,
-        clock: Callable[[], float] = perf_counter,
-        allow_other_settings: bool = False,
+        **planning: Any,
     ) -> None:
         """Build planner, law and adaptation."""
-        super().__init__(settings, metric, replan_every, deadline, clock, allow_other_settings)
+        super().__init__(settings, metric, **planning)
         law = self.expert.law
         # A function of the module, so that the policy can be pickled.
         regressor = partial(_friction_and_mass, law.system)
