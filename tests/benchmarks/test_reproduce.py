@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import filecmp
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -205,3 +206,58 @@ def test_what_is_learned_from_a_network_has_sane_labels_and_nobody_at_rest():
     np.testing.assert_allclose(
         kept.acceleration, [[1.2, -1.6, 1.0], [0.1, 0.2, 9.0], [0, 0, 0]], rtol=1e-6
     )
+
+
+SWING = """
+from dataclasses import dataclass
+
+import numpy as np
+
+from lagros_envs.task import Learning, MetricDesign, Scenario, Task
+
+
+@dataclass(frozen=True)
+class Pendulum:
+    state_dim: int = 2
+    control_dim: int = 1
+
+    def derivative(self, state, control, functions):
+        return state[1], functions.sin(state[0]) - 0.2 * state[1] + control[0]
+
+
+@dataclass(frozen=True)
+class Swing(Task):
+    system: Pendulum = Pendulum()
+    time_limit: float = 2.0
+    name, title = "swing", "Swing"
+    control_scale = (9.0,)
+    metric = MetricDesign((-1.0, -2.0), (1.0, 2.0), (0.3, 0.3), (-9.0,), (9.0,))
+    learning = Learning()
+
+    def sample(self, rng):
+        return Scenario(rng.uniform(-0.5, 0.5, 2), np.zeros(2))
+"""
+
+
+def test_a_task_of_ones_own_that_has_changed_does_not_go_on_with_a_run(tmp_path, monkeypatch):
+    """Whatever of it has changed; what it looks like, and how it is called, may."""
+    monkeypatch.setattr("lagros_benchmarks.run.reproduce._Making.run", lambda making: None)
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "swing.py"
+    path.write_text(SWING)
+    reproduce(tmp_path / "run", ReproduceSettings("./swing.py", jobs=1))
+    path.write_text(SWING + "\n    def outline(self, state):\n        return ()\n")
+    os.utime(path, ns=(1, 1))
+    reproduce(tmp_path / "run", ReproduceSettings(f"{path}:Swing", jobs=1))
+    changes = [
+        ("0.2 * state[1]", "0.3 * state[1]"),
+        ("(9.0,)\n    metric", "(9.0,)\n    control_high = (9.0,)\n    metric"),
+        ("(0.3, 0.3)", "(0.3, 0.2)"),
+        ("rng.uniform(-0.5", "rng.uniform(-0.4"),
+        ("time_limit: float = 2.0", "time_limit: float = 3.0"),
+    ]
+    for number, change in enumerate(changes, 2):
+        path.write_text(SWING.replace(*change))
+        os.utime(path, ns=(number, number))
+        with pytest.raises(ValueError, match="holds a run of other settings; name another folder"):
+            reproduce(tmp_path / "run", ReproduceSettings("swing.py", jobs=1))

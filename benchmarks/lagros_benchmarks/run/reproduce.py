@@ -22,9 +22,12 @@ from lagros_benchmarks.run.experiment import Progress
 from lagros_benchmarks.run.reproduction import Say, made_before
 from lagros_benchmarks.run.settings import BenchmarkSettings
 from lagros_envs.checks import check_fields
+from lagros_envs.dynamics.straight_line import statements, straight_line
 from lagros_envs.files import write_atomic
+from lagros_envs.numbers import functions
 from lagros_envs.registry import find_task, task_names
 from lagros_envs.task import Learning, Task
+from lagros_envs.tasks import SHIPPED
 from lagros_policies.backends import LOKY, Backend
 from lagros_policies.contraction import Metric, load_metric, save_metric
 from lagros_policies.learning.dataset import ExpertData, ExpertDataSettings, generate
@@ -32,6 +35,7 @@ from lagros_policies.learning.features import seen, view_of
 from lagros_policies.learning.layers import check_widths
 from lagros_policies.learning.metric import metric_settings
 from lagros_policies.learning.networks import Mlp
+from lagros_policies.learning.shards import claim
 from lagros_policies.learning.train import TrainingSettings, fit, learning_error
 from lagros_policies.trained_for import training_of, weights_record
 
@@ -39,6 +43,12 @@ Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.intp]
 
 _SHARDS = 20  # pieces of work, where they divide plans and samples
+# What metric, plans and networks ask of a task besides its settings, equation and scenarios.
+_ASKED = (
+    *("metric", "feedback", "position", "body_radius", "most_discs", "margin"),
+    *("state_low", "state_high", "state_scale"),
+    *("control_low", "control_high", "control_scale", "control_centre", "control_spread"),
+)
 _POLICIES = ("learned", "tube-mpc", "lagros", "lqr")
 
 
@@ -131,6 +141,8 @@ class ReproduceSettings:
 
     def make(self, folder: Path, progress: Progress, say: Say) -> None:
         """Make metric, data and networks; see `reproduction.reproduce`."""
+        if self.description.name not in SHIPPED:
+            claim(folder / "described.json", _described(self.description), "a run")
         _Making(self, folder, progress, say).run()
 
     def benchmark(self, folder: Path | None) -> BenchmarkSettings:
@@ -167,6 +179,20 @@ def _data(how: Learning, plans: int, samples: int, seed: int) -> ExpertDataSetti
     return ExpertDataSettings(
         plans, samples, shards, disturbance_bound=how.disturbance_bound, seed=seed
     )
+
+
+def _described(task: Task) -> dict[str, Any]:
+    """Return what a run depends on that its author may change: equation, limits, scenarios."""
+    n, m = task.system.state_dim, task.system.control_dim
+
+    def equation(numbers: Sequence[Any]) -> Sequence[Any]:
+        return task.system.derivative(numbers[:n], numbers[n:], functions)
+
+    names = [f"{kind}{index}" for kind, count in (("x", n), ("u", m)) for index in range(count)]
+    lines, rates = statements(straight_line(equation, names))
+    said = {name: repr(getattr(task, name)) for name in _ASKED}
+    first = task.sample(np.random.default_rng(0))
+    return {"settings": repr(task), "equation": [*lines, *rates], "first": repr(first), **said}
 
 
 def _weights(folder: Path, task: Task, name: str) -> Path:
@@ -317,10 +343,11 @@ class _Making:
         }
         path = _weights(self.folder, self.task, name).with_suffix(".json")
         write_atomic(path, json.dumps(record, indent=1) + "\n")
+        shown = {"mean": error.mean, "p99": error.p99, "max": error.maximum}
+        figures = ", ".join(f"{what} {value:.3g} {unit}".strip() for what, value in shown.items())
         self.say(
             f"{name} ({perf_counter() - begun:.0f} s): learning error on {error.samples} held-out "
-            f"samples: mean {error.mean:.3g} {unit}, p99 {error.p99:.3g} {unit}, "
-            f"max {error.maximum:.3g} {unit}"
+            f"samples: {figures}"
         )
 
 

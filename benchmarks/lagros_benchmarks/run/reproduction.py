@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 from lagros_benchmarks.run.experiment import Progress
 from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_envs.registry import find_task
 from lagros_policies.learning.shards import claim
 
 # Takes a line after each stage.
@@ -80,6 +81,9 @@ def reproduce(
     """
     folder = folder.absolute()
     record = {name: value for name, value in asdict(settings).items() if name not in settings.free}
+    if "task" in record:
+        # However it was called: ./car.py or car.py.
+        record["task"] = find_task(record["task"]).name
     folder.mkdir(parents=True, exist_ok=True)
     claim(folder / "settings.json", record, "a run")
     settings.make(folder, progress or (lambda *_: None), say or (lambda _: None))
