@@ -252,6 +252,12 @@ class Task(Described):
         units = {name.partition("[")[2].rstrip("]") for name in self.control_names}
         return units.pop() if len(units) == 1 else ""
 
+    @property
+    def squared_unit(self) -> str:
+        """The unit of ||u||^2, "N²" or "(m/s^2)²"; "" where the controls have no one unit."""
+        unit = self.control_unit
+        return f"({unit})²" if len(unit) > 1 else unit and f"{unit}²"
+
     def control(self, action: FloatArray) -> FloatArray:
         """Return u of actions (..., m), as the environment applies it."""
         with np.errstate(over="ignore"):

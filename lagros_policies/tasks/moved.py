@@ -67,6 +67,10 @@ NAMES = {
         "Lipschitz": f"{_CARTPOLE}.lipschitz",
         "metric_drift": "lagros_policies.proof.bounds",
     },
+    "lagros_policies.planning": {
+        "CartPolePlanner": f"{_CARTPOLE}.planner",
+        "CartPolePlannerSettings": f"{_CARTPOLE}.planner",
+    },
     "lagros_policies.export": {
         "NAMES": "lagros_policies.export.source",
         "SpacecraftSource": f"{_SPACECRAFT}.export",

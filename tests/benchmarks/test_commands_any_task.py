@@ -300,3 +300,11 @@ def test_a_zip_of_stable_baselines3_flies(invoke: Any) -> None:
     result = invoke("watch", FILE, "--policy", "agent.zip", "--seconds", 1, "--video", "a.gif")
     assert result.exit_code == 0, result.output
     assert "agent.zip on seed 0" in result.output
+
+
+def test_a_run_of_a_correction_is_one_folder_whatever_the_unit() -> None:
+    from lagros_benchmarks.training.course import default_training
+
+    run = replace(default_training("slider", "td3"), largest_correction=1.5)
+    assert run.described.control_unit == "m/s^2"
+    assert run.label == "residual-td3-1.5ms2"

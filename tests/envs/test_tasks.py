@@ -280,3 +280,18 @@ def test_what_is_drawn_shows_body_goal_and_discs(name):
         env.step(np.zeros(env.action_space.shape, np.float32))
     assert np.any(env.render() != empty)
     env.close()
+
+
+@pytest.mark.parametrize(
+    ("names", "unit", "squared"),
+    [
+        ((), "", ""),
+        (("F [N]", "G [N]"), "N", "N²"),
+        (("a [m/s^2]", "b [m/s^2]"), "m/s^2", "(m/s^2)²"),
+        (("tau [N m]", "sigma [N m]"), "N m", "(N m)²"),
+        (("a [m/s^2]", "omega [rad/s]"), "", ""),
+    ],
+)
+def test_the_unit_of_effort_is_that_of_the_controls_squared(names, unit, squared):
+    task = type("Named", (type(PUCK),), {"control_names": names})()
+    assert (task.control_unit, task.squared_unit) == (unit, squared)

@@ -52,10 +52,8 @@ def episode_objects(run: SingleRun) -> Iterable[dict[str, Any]]:
 def _units(task: Task) -> Row:
     """Return the units of the effort and of the state; "" where there is none."""
     states = [name.partition("[")[2].rstrip("]") for name in task.state_names]
-    control = task.control_unit
-    squared = f"({control})²s" if len(control) > 1 else f"{control}²s"
     return {
-        "effort": squared if control else "",
+        "effort": task.squared_unit and f"{task.squared_unit}s",
         "state": ", ".join(states) if all(states) else "",
     }
 

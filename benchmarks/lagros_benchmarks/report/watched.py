@@ -88,7 +88,7 @@ class SingleGame:
         success = info["success"] and self.error is None
         reached = f"success at {info['success_time']:.1f} s" if success else "no success"
         end = "collided" if info.get("collided") else "fallen" if info["fallen"] else "not fallen"
-        unit = self.env.settings.control_unit
+        unit = self.env.settings.squared_unit
         spent = efforts("effort", info["effort_to_success"], info["effort"], unit)
         return f"{reached}, {end}, {spent}"
 
@@ -100,10 +100,9 @@ def efforts(what: str, to_success: float, to_end: float, unit: str) -> str:
         what: What to call it.
         to_success: To the first success, if there was one.
         to_end: To the end of the episode.
-        unit: Of the control; "" for none.
+        unit: Of the control, squared; "" for none.
     """
-    unit = f"({unit})" if "/" in unit or " " in unit else unit
-    squared = f" {unit}²s" if unit else ""
+    squared = f" {unit}s" if unit else ""
     if to_end == to_success:
         return f"{what} {to_end:.2f}{squared}"
     return f"{what} to success {to_success:.2f}{squared}, to the end {to_end:.2f}{squared}"

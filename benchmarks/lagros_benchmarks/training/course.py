@@ -52,7 +52,7 @@ class SingleCourse:
 
     def panels(self, task: Task) -> tuple[Panel, ...]:
         """Return what is drawn of the learning curves."""
-        unit = f" [{task.control_unit}² s]" if task.control_unit else ""
+        unit = f" [{task.squared_unit} s]" if task.squared_unit else ""
         collided = (("collided", "collided [%]", 100.0),) if task.most_discs else ()
         return (
             ("success", "success [%]", 100.0),
@@ -64,7 +64,7 @@ class SingleCourse:
 
     def columns(self, task: Task) -> tuple[Column, ...]:
         """Return what is told of the end."""
-        unit = f"{task.control_unit}²s" if task.control_unit else ""
+        unit = task.squared_unit and f"{task.squared_unit}s"
         collided: tuple[Column, ...] = ()
         if task.most_discs:
             collided = (("coll.", "%", lambda row: percent(row["collided"])),)

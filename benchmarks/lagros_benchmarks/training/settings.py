@@ -6,6 +6,7 @@ beside its weights.
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, ClassVar
 
@@ -297,7 +298,8 @@ class SingleTraining(Training):
         """Name of the runs that differ in the seed alone."""
         if self.largest_correction is None:
             return super().label
-        unit = self.described.control_unit
+        # A part of the name of a folder.
+        unit = re.sub(r"\W", "", self.described.control_unit)
         return f"residual-{self.algorithm.name}-{self.largest_correction:g}{unit}"
 
 

@@ -90,7 +90,7 @@ class SpacecraftGame(SingleGame):
         to_end = sum(info["effort"] for info in infos) / count
         return (
             f"{arrived} of {count} arrived, {collided} collided, in {self.env.time:.1f} s; "
-            + efforts("mean effort of an agent", to_success, to_end, "N")
+            + efforts("mean effort of an agent", to_success, to_end, "N²")
         )
 
     def _nominal(self) -> Any:
