@@ -27,8 +27,8 @@ from lagros_envs.tasks.spacecraft.scenarios import Preset, Scenario
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
-from lagros_policies.learning.network_policy import PRETRAINED
 from lagros_policies.learning.networks import Mlp
+from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.spacecraft.ppo import (
     FEATURES,
     SpacecraftPpoPolicy,

@@ -12,7 +12,7 @@ import pytest
 
 import lagros_envs  # noqa: F401
 import lagros_policies
-from lagros_benchmarks.run.library import position_margin
+from lagros_benchmarks.tasks.spacecraft.claims import position_margin
 from lagros_envs.tasks.cartpole import task
 from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv

@@ -19,11 +19,12 @@ from lagros_policies.contraction import (
     extreme_eigenvalues,
 )
 from lagros_policies.learning.dataset import ExpertDataSettings, generate
+from lagros_policies.learning.features import seen
 from lagros_policies.learning.networks import Mlp, read_safetensors
 from lagros_policies.learning.train import learning_error
 from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
-from lagros_policies.tasks.cartpole.features import cartpole_features
+from lagros_policies.tasks.cartpole.features import CartPoleView
 from tests.policies.shipped import shipped_metric
 
 
@@ -219,8 +220,8 @@ def record(name):
 @needs(METRIC, "cartpole_lagros.safetensors", "cartpole_lagros.json")
 def test_recorded_learning_error_of_lagros_is_that_of_fresh_episodes(fresh):
     network = Mlp.load(PRETRAINED / "cartpole_lagros.safetensors")
-    features, side = cartpole_features(fresh.observation.astype(np.float32))
-    labels = (fresh.control * side[:, None]).astype(np.float32)
+    features, side = seen(CartPoleView(), fresh.observation.astype(np.float32))
+    labels = (fresh.control * side).astype(np.float32)
     error, stated = learning_error(network, features, labels), record("lagros")["learning_error"]
     assert error.mean < 2.0 * stated["mean"]
     assert error.mean > 0.3 * stated["mean"]
@@ -231,8 +232,8 @@ def test_recorded_learning_error_of_lagros_is_that_of_fresh_episodes(fresh):
 def test_recorded_learning_error_of_the_learned_policy_is_that_of_fresh_episodes(fresh):
     network = Mlp.load(PRETRAINED / "cartpole_learned.safetensors")
     observation, control = fresh.nominal_pairs(CartPoleSettings())
-    features, side = cartpole_features(observation.astype(np.float32))
-    labels = (control * side[:, None]).astype(np.float32)
+    features, side = seen(CartPoleView(), observation.astype(np.float32))
+    labels = (control * side).astype(np.float32)
     error, stated = learning_error(network, features, labels), record("learned")["learning_error"]
     assert error.mean < 3.0 * stated["mean"]
     assert error.mean < 0.05 * np.abs(labels).mean()
