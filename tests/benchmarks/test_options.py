@@ -212,7 +212,7 @@ ROWS = {
     "demo": {},
     "reproduce": REPRODUCE | {"task": Row(NAMES, ("",))},
     "watch": WATCH | {"task": Row(NAMES, ("",))},
-    "export": EXPORT | {"policy": Row((*NAMES, "lqr"), ("",))},
+    "export": EXPORT | {"policy": Row((*NAMES, "lqr"), ("",)), "task": Row(NAMES, ("",))},
     "certify": CERTIFY | {"task": Row(NAMES, ("",))},
     "train": TRAIN | {"task": Row(NAMES, ("",))},
     "attack": ATTACK | {"task": Row(NAMES, ("",))},

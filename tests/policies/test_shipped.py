@@ -231,7 +231,7 @@ def test_recorded_learning_error_of_lagros_is_that_of_fresh_episodes(fresh):
 @needs(METRIC, "cartpole_learned.safetensors", "cartpole_learned.json")
 def test_recorded_learning_error_of_the_learned_policy_is_that_of_fresh_episodes(fresh):
     network = Mlp.load(PRETRAINED / "cartpole_learned.safetensors")
-    observation, control = fresh.nominal_pairs(CartPoleSettings())
+    observation, control, _ = fresh.nominal_pairs(CartPoleSettings())
     features, side = seen(CartPoleView(), observation.astype(np.float32))
     labels = (control * side).astype(np.float32)
     error, stated = learning_error(network, features, labels), record("learned")["learning_error"]
