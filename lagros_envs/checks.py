@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 import types
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from numbers import Integral, Real
@@ -91,22 +91,37 @@ def check_at_most(name: str, value: float, most: float, otherwise: str = "") -> 
     _check(is_number(value) and value <= most, name, value, f"at most {most:g}", otherwise)
 
 
-def check_fields(settings: Any) -> None:
-    """Check every field of a dataclass against its annotation, before ranges are.
+def check_fields(
+    settings: Any,
+    positive: Iterable[str] = (),
+    not_negative: Iterable[str] = (),
+    least: Mapping[str, int] | None = None,
+) -> None:
+    """Check every field of a dataclass against its annotation, then the ranges of those named.
 
     Numbers must be finite, integers whole, flags true or false, and so on through optional fields,
     tuples and literals; what is annotated otherwise (arrays, functions, mappings) is not looked at.
 
     Args:
         settings: An instance of a dataclass.
+        positive: Names of numbers above zero.
+        not_negative: Names of numbers that may be zero.
+        least: By name, the least that a whole number may be.
 
     Raises:
-        ValueError: A field has a value of another type, or a number that is not finite.
+        ValueError: A field has a value of another type, or a number that is not finite or out of
+            range.
     """
     for name, hint in _hints(type(settings)).items():  # type: ignore[arg-type]
         value = getattr(settings, name)
         needed = _unmet(value, hint)
         _check(not needed, name, value, needed)
+    for name in positive:
+        check_positive(name, getattr(settings, name))
+    for name in not_negative:
+        check_not_negative(name, getattr(settings, name))
+    for name, fewest in (least or {}).items():
+        check_whole(name, getattr(settings, name), fewest)
 
 
 def check_each(name: str, values: Sequence[int], least: int, most: int | None = None) -> None:

@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 
 from lagros_envs.arrays import FloatArray
-from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
+from lagros_envs.checks import check_fields
 from lagros_envs.dynamics import System
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.semidefinite import solve_conic, svec, symmetric_basis
@@ -84,12 +84,8 @@ class HeldDesign:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        check_fields(self)
         positive = "period", "rate", "disturbance_bound", "control_penalty", "floor", "control_unit"
-        for name in positive:
-            check_positive(name, getattr(self, name))
-        check_not_negative("margin", self.margin)
-        check_whole("degree", self.degree)
+        check_fields(self, positive, not_negative=["margin"], least={"degree": 1})
 
 
 @dataclass(frozen=True)

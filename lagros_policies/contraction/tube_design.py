@@ -28,7 +28,7 @@ import numpy as np
 
 from lagros_envs.aliases import moved_names
 from lagros_envs.arrays import BoolArray, FloatArray
-from lagros_envs.checks import check_fields, check_not_negative, check_positive
+from lagros_envs.checks import check_fields
 from lagros_envs.dynamics import System, control_matrix, jacobian
 from lagros_policies.contraction.cvstem import InfeasibleError
 from lagros_policies.contraction.regions import BoxRegion
@@ -159,10 +159,8 @@ class TubeDesign:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        check_fields(self)
-        for name in ("rate", "disturbance_bound", "control_penalty", "floor"):
-            check_positive(name, getattr(self, name))
-        check_not_negative("margin", self.margin)
+        positive = "rate", "disturbance_bound", "control_penalty", "floor"
+        check_fields(self, positive, not_negative=["margin"])
         if self.method == "output" and self.output is None:
             raise ValueError("output=None: method='output' needs the direction c")
         if self.method == "paper" and self.output is not None:

@@ -12,14 +12,14 @@ be.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
 from lagros_envs.arrays import FloatArray, IntArray
-from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
+from lagros_envs.checks import check_fields
 from lagros_policies.planning.vectors import segment_distance
 
 # Cells that every agent has at least, however many agents there are.
@@ -61,13 +61,12 @@ class GridSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        check_fields(self)
-        for item in fields(self):
-            check_not_negative(item.name, getattr(self, item.name))
-        for name in ("cell", "search_cell", "search_period"):
-            check_positive(name, getattr(self, name))
-        for name in ("most_cells", "most_search_cells"):
-            check_whole(name, getattr(self, name), _FEWEST)
+        check_fields(
+            self,
+            positive=("cell", "search_cell", "search_period"),
+            not_negative=("border", "preference", "crossing_cost", "sidestep"),
+            least={"most_cells": _FEWEST, "most_search_cells": _FEWEST},
+        )
         if self.preference >= 1.0:
             raise ValueError(f"preference={self.preference!r} must be below 1")
 

@@ -219,13 +219,13 @@ class Preset:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        check_fields(self)
+        check_fields(
+            self,
+            positive=("arena", "obstacle_radius", "agent_radius"),
+            not_negative=("margin", "least_way", "heading_range"),
+        )
         use_plain_numbers(self)
-        for name in ("arena", "obstacle_radius", "agent_radius"):
-            check_positive(name, getattr(self, name))
         check_not_negative("core_radius", self.core, "or None for agent_radius")
-        for name in ("margin", "least_way", "heading_range"):
-            check_not_negative(name, getattr(self, name))
         if self.arena > LARGEST:
             raise ValueError(f"arena={self.arena!r} must be at most {LARGEST:g}")
         fewest, most = self.obstacle_count

@@ -11,7 +11,7 @@ from itertools import islice
 import numpy as np
 
 from lagros_envs.arrays import FloatArray, IntArray
-from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
+from lagros_envs.checks import check_fields, check_not_negative, check_positive
 from lagros_policies.planning.grid_path import (
     GridSettings,
     shortest_paths,
@@ -79,18 +79,17 @@ class JointPlannerSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        check_fields(self)
-        for name in ("horizon", "control_period", "mass", "speed_limit", "check_period"):
-            check_positive(name, getattr(self, name))
+        check_fields(
+            self,
+            positive=("horizon", "control_period", "mass", "speed_limit", "check_period"),
+            not_negative=("pair_share", "margin_growth", "start_margin"),
+            least={"nodes": 2, "candidates": 1, "restarts": 0, "searches": 0},
+        )
         if self.force_limit is not None:
             check_positive("force_limit", self.force_limit, "or None for no limit")
-        for name in ("pair_share", "margin_growth", "start_margin"):
-            check_not_negative(name, getattr(self, name))
         falling = sorted(self.margins, reverse=True)
         if not self.margins or list(self.margins) != falling or not 0.0 <= falling[-1] < math.inf:
             raise ValueError(f"margins={self.margins!r} must be falling numbers >= 0, at least one")
-        for name, least in (("nodes", 2), ("candidates", 1), ("restarts", 0), ("searches", 0)):
-            check_whole(name, getattr(self, name), least)
         divisor("control_period", self.control_period, self.node_period)
         divisor("check_period", self.check_period, self.node_period)
 

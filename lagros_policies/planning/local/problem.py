@@ -10,7 +10,7 @@ import numpy as np
 import piqp
 
 from lagros_envs.arrays import BoolArray, FloatArray
-from lagros_envs.checks import check_fields, check_not_negative, check_positive, check_whole
+from lagros_envs.checks import check_fields, check_positive
 from lagros_policies.planning.grid_path import walk
 from lagros_policies.planning.local.guess import pass_aside, progress, way_around
 from lagros_policies.planning.local.motion import (
@@ -81,22 +81,15 @@ class LocalPlannerSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        check_fields(self)
-        for item in fields(self):
-            if item.name != "force_limit":
-                check_not_negative(item.name, getattr(self, item.name))
+        check_fields(
+            self,
+            positive=("mass", "near_period", "speed_limit", "penalty", "qp_tolerance"),
+            not_negative=[item.name for item in fields(self) if item.name != "force_limit"],
+            # The second pass is the first that may know of the speed limit.
+            least={"near_steps": 1, "far_steps": 1, "passes": 2, "most_distances": 1},
+        )
         if self.force_limit is not None:
             check_positive("force_limit", self.force_limit, "or None for no limit")
-        for name in ("mass", "near_period", "speed_limit", "penalty", "qp_tolerance"):
-            check_positive(name, getattr(self, name))
-        # The second pass is the first that may know of the speed limit.
-        for name, least in (
-            ("near_steps", 1),
-            ("far_steps", 1),
-            ("passes", 2),
-            ("most_distances", 1),
-        ):
-            check_whole(name, getattr(self, name), least)
         if self.least_duration <= self.foresight:
             raise ValueError(
                 f"least_duration={self.least_duration!r} must exceed the {self.near_steps} steps "
@@ -260,17 +253,9 @@ class LocalProblem:
         most = np.full(size, _UNBOUNDED)
         if settings.force_limit is not None:
             least[: 2 * steps], most[: 2 * steps] = -settings.force_limit, settings.force_limit
-        equality, target = self._arrival(size)
+        costs, inequalities = (np.diag(diagonal), linear), (inequality, low, high)
         values = _solve(
-            diagonal,
-            linear,
-            equality,
-            target,
-            inequality,
-            low,
-            high,
-            (least, most),
-            settings.qp_tolerance,
+            settings.qp_tolerance, *costs, *self._arrival(size), *inequalities, least, most
         )
         return None if values is None else values[: 2 * steps].reshape(2, steps).T
 
@@ -322,31 +307,12 @@ def _instants(edges: FloatArray, settings: LocalPlannerSettings) -> tuple[FloatA
     return times, np.concatenate([parts[1], parts[3], [True]])
 
 
-def _solve(
-    diagonal: FloatArray,
-    linear: FloatArray,
-    equality: FloatArray,
-    target: FloatArray,
-    inequality: FloatArray,
-    low: FloatArray,
-    high: FloatArray,
-    bounds: tuple[FloatArray, FloatArray],
-    tolerance: float,
-) -> FloatArray | None:
-    """Return the optimum of a dense program with PIQP, or None if it fails."""
+def _solve(tolerance: float, *program: FloatArray) -> FloatArray | None:
+    """Return the optimum of a dense program, as PIQP's `setup` takes it, or None if it fails."""
     solver = piqp.DenseSolver()
     solver.settings.eps_abs = solver.settings.eps_rel = tolerance
     solver.settings.check_duality_gap = False
-    solver.setup(
-        np.diag(diagonal),
-        linear,
-        equality,
-        target,
-        inequality,
-        low,
-        high,
-        *bounds,
-    )
+    solver.setup(*program)
     status = solver.solve()
     values = np.array(solver.result.x)
     return values if status == piqp.PIQP_SOLVED and np.all(np.isfinite(values)) else None

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lagros_envs.arrays import BoolArray, FloatArray
-from lagros_envs.checks import check_fields, check_not_negative
+from lagros_envs.checks import check_fields
 from lagros_envs.dynamics import System
 from lagros_envs.numbers import Interval, exact, functions
 from lagros_envs.tasks.cartpole.physics import ANGLE, VELOCITY, CartPole
@@ -51,9 +51,7 @@ class ProofBox:
 
     def __post_init__(self) -> None:
         """Check the bounds."""
-        check_fields(self)
-        for item in fields(self):
-            check_not_negative(item.name, getattr(self, item.name))
+        check_fields(self, not_negative=[item.name for item in fields(self)])
         if self.angle >= math.pi / 2:
             raise ValueError(f"angle={self.angle!r} must be below pi/2")
 

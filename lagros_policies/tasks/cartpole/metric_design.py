@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lagros_envs.arrays import FloatArray
-from lagros_envs.checks import check_fields, check_seed, check_whole
+from lagros_envs.checks import check_fields, check_seed
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.tasks.cartpole import task
 from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE
@@ -54,10 +54,8 @@ class MetricDesignSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_fields(self)
+        check_fields(self, least={"plans": 1, "pool": 1, "checks": 1})
         check_seed(self.seed)
-        for name in ("plans", "pool", "checks"):
-            check_whole(name, getattr(self, name))
 
     def design(self, task: task.CartPoleSettings) -> Metric:
         """Return the metric; see `design_cartpole_metric`."""

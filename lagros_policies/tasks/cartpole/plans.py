@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from lagros_envs.arrays import BoolArray, FloatArray
-from lagros_envs.checks import check_fields, check_not_negative
+from lagros_envs.checks import check_fields
 from lagros_envs.dynamics import System, control_matrix, jacobian
 from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY
 from lagros_policies.tasks.cartpole.box import ProofBox
@@ -40,9 +40,7 @@ class PlanBox:
 
     def __post_init__(self) -> None:
         """Check the bounds."""
-        check_fields(self)
-        for item in fields(self):
-            check_not_negative(item.name, getattr(self, item.name))
+        check_fields(self, not_negative=[item.name for item in fields(self)])
 
     @property
     def bounded(self) -> list[int]:

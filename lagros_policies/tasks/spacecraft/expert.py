@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from lagros_envs.arrays import FloatArray
-from lagros_envs.checks import check_fields, check_positive
+from lagros_envs.checks import check_fields
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_envs.tasks.spacecraft.task import STATE_DIM, SpacecraftSettings
 from lagros_policies.planning.joint.planner import JointPlanner
@@ -55,9 +55,7 @@ class SpacecraftExpertSettings:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        check_fields(self)
-        for item in fields(self):
-            check_positive(item.name, getattr(self, item.name))
+        check_fields(self, positive=[item.name for item in fields(self)])
 
 
 class SpacecraftExpert:

@@ -13,9 +13,6 @@ from lagros_envs.arrays import FloatArray, IntArray
 from lagros_envs.checks import (
     check_each,
     check_fields,
-    check_not_negative,
-    check_positive,
-    check_whole,
 )
 from lagros_envs.dynamics import System, control_matrix, state_dependent_coefficient
 from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE
@@ -71,12 +68,13 @@ class NeuralTrainingSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_fields(self)
+        check_fields(
+            self,
+            positive=["learning_rate"],
+            not_negative=["margin"],
+            least={"fit_steps": 1, "batch": 1, "condition_steps": 0},
+        )
         check_each("hidden", self.hidden, 1)
-        for name, least in (("fit_steps", 1), ("batch", 1), ("condition_steps", 0)):
-            check_whole(name, getattr(self, name), least)
-        check_positive("learning_rate", self.learning_rate)
-        check_not_negative("margin", self.margin)
 
 
 def fit_network(
