@@ -142,7 +142,7 @@ def print_report(rows: Sequence[Row]) -> None:
     console = Console(highlight=False)
     for group in by_condition(rows):
         console.print(tables.terminal_table(group))
-        if not tables.texts(group[0]).FRAMED:
+        if not tables.texts(group[0]).framed(group[0]):
             console.print()  # where a frame would end in an empty line
         for line in tables.comparison_lines(group):
             # As text, here and below: names and units may hold what rich takes for markup.

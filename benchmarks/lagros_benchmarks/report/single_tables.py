@@ -34,7 +34,11 @@ _PLAIN_LEGEND = (
     "the end) with 95 % intervals; coll.: touched a disc; fell: left what the task allows; effort: "
     "mean integral of ‖u − centre‖² to success, else to the end; Δt: time of one call of predict."
 )
-FRAMED = True
+
+
+def framed(row: Row) -> bool:
+    """Return whether the terminal table has room for a frame in 80 columns."""
+    return _has_tube(row)
 
 
 def legend(row: Row) -> str:

@@ -24,10 +24,9 @@ if TYPE_CHECKING:
 
 
 class _Texts(Protocol):
-    """What a module that words the tables of a task has; frames are of tables that have room."""
+    """What a module that words the tables of a task has."""
 
-    FRAMED: bool
-
+    def framed(self, row: Row) -> bool: ...
     def legend(self, row: Row) -> str: ...
     def columns(self, row: Row) -> tuple[Column, ...]: ...
     def title(self, row: Row) -> str: ...
@@ -54,7 +53,7 @@ def terminal_table(group: Sequence[Row]) -> Table:
     shown = words.columns(group[0])
     headings = [f"{heading}\n{unit}".strip() for heading, unit, _ in shown]
     contents = [[content(row) for _, _, content in shown] for row in words.ordered(group)]
-    return _table(headings, contents, words.title(group[0]), words.FRAMED)
+    return _table(headings, contents, words.title(group[0]), words.framed(group[0]))
 
 
 def comparison_lines(group: Sequence[Row]) -> Iterator[str]:

@@ -68,8 +68,9 @@ _COLUMNS: tuple[Column, ...] = (
 )
 
 
-# The widest figures of eight columns leave no room for a frame.
-FRAMED = False
+def framed(row: Row) -> bool:
+    """Return whether there is room for a frame: not beside the widest figures of eight columns."""
+    return False
 
 
 def legend(row: Row) -> str:
