@@ -53,7 +53,6 @@ class Moved(MetaPathFinder):
     """
 
     def __init__(self, moved: Mapping[str, str]) -> None:
-        """Keep the table."""
         self._moved = moved
         self._packages = {name.partition(".")[0] for name in moved}
 

@@ -82,7 +82,6 @@ class Canvas:
         caption: str,
         fonts: tuple[int, ...],
     ) -> None:
-        """Prepare a canvas, and a window in the mode "human"."""
         self._seen = render_mode == "human"
         self._fps, self._size, self._caption, self._heights = fps, size, caption, fonts
         self._prepare()

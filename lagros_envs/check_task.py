@@ -39,9 +39,6 @@ _QUANTITY = r"[^\[\]]+ \[[^\[\]]+\]"
 def check_task(task: Any) -> None:
     """Check names, shapes, units and ranges of a task, its scenarios and its system.
 
-    Args:
-        task: The task.
-
     Raises:
         TypeError: It is no `Task`, or something of it is of the wrong type.
         ValueError: Something is wrong; the message names it, with what to write instead.

@@ -223,12 +223,6 @@ def check_flag(name: str, value: bool, otherwise: str = "") -> None:
 def check_instance(name: str, value: object, *kinds: type, otherwise: str = "") -> None:
     """Check an object that must be of one of some classes.
 
-    Args:
-        name: What the caller calls it.
-        value: The object.
-        kinds: The classes.
-        otherwise: As in `check_positive`.
-
     Raises:
         ValueError: It is of none of them.
     """
@@ -238,11 +232,6 @@ def check_instance(name: str, value: object, *kinds: type, otherwise: str = "") 
 
 def check_name(name: str, value: str, valid: Iterable[str]) -> None:
     """Check a name against those that are known; the message suggests a close one.
-
-    Args:
-        name: What the caller calls it.
-        value: The name.
-        valid: The known ones.
 
     Raises:
         ValueError: It is none of them.

@@ -182,10 +182,6 @@ class NotStartedError(RuntimeError, AttributeError):
 def check_started(started: bool, what: str) -> None:
     """Refuse what only an episode has.
 
-    Args:
-        started: Whether there is one.
-        what: What was asked for.
-
     Raises:
         NotStartedError: The environment was not reset.
     """

@@ -253,7 +253,6 @@ class Disturbance(ByValue):
     metric: FloatArray | Callable[[FloatArray], FloatArray] | None = None
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         if not callable(self.kind) and not (isinstance(self.kind, str) and self.kind in KINDS):
             raise ValueError(
                 f"disturbance={shown(self.kind)} is not known; use one of {', '.join(KINDS)} or a "

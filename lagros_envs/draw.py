@@ -96,7 +96,6 @@ class PlaneRenderer(Canvas):
     """
 
     def __init__(self, task: Task, render_mode: str, fps: int) -> None:
-        """Prepare a canvas, and a window in the mode "human"."""
         super().__init__(render_mode, fps, (WIDTH, HEIGHT), task.env_id, (15, 17, 20))
         self._task = task
         # The frames of this episode, without arrays that others write to.

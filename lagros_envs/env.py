@@ -112,7 +112,6 @@ class TaskEnv(OfTask, Conforming, gym.Env[Float32Array, Float32Array]):
         render_mode: str | None = None,
         task: Task | str | None = None,
     ) -> None:
-        """Build the environment; see the class for the arguments."""
         self.render_mode = check_render_mode(render_mode)
         self.settings = self._settings(task, settings)
         self.disturbance = of_task.disturbance_of(

@@ -34,9 +34,6 @@ def first_task() -> str:
 def task_named(name: str) -> Described:
     """Return a task with its default settings.
 
-    Args:
-        name: As in `task_names`.
-
     Raises:
         ValueError: There is no such task.
     """

@@ -34,7 +34,6 @@ class Streams:
     """
 
     def __init__(self, seed: int) -> None:
-        """Remember the seed."""
         self.seed = seed
 
     @cached_property
@@ -118,7 +117,6 @@ class SharedStreams:
     """
 
     def __init__(self, source: np.random.Generator) -> None:
-        """Seed them."""
         self.source = source
         words = source.integers(2**63, size=(2, _POOL))
         self.scenario, self.disturbance = map(np.random.default_rng, words)

@@ -213,7 +213,6 @@ class Task(Described):
     success_bonus = 10.0
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         check_fields(self)
         use_plain_numbers(self)
         for name in ("control_period", "time_limit"):

@@ -31,7 +31,6 @@ class PaperTube:
     contraction_rate: float = 0.6
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         use_plain_numbers(self)
         for name in ("steady_radius", "contraction_rate"):

@@ -87,7 +87,6 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
         max_episode_steps: int | None = None,
         task: Task | str | None = None,
     ) -> None:
-        """Build the worlds; see the class for the arguments."""
         check_whole("num_envs", num_envs)
         self.settings = self._settings(task, settings)
         self.option_names = ("reset_mask", *of_task.option_names(self.settings))

@@ -83,7 +83,6 @@ class Actor:
     metadata: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check shapes and values."""
         count, outputs = self.network.inputs, self.network.outputs
         fits = self.features.ndim == 2 and len(self.features) == count
         if not fits or len(self.control_scale) != outputs:
@@ -192,7 +191,6 @@ class ActorPolicy(BasePolicy):
         weights: Path | str | Actor | None = None,
         allow_other_settings: bool = False,
     ) -> None:
-        """Load the actor; see the class for the arguments."""
         self.settings = task = task_of(settings)
         if weights is None:
             made = self.recorded_as or self.name

@@ -261,7 +261,6 @@ class RandomPolicy(BasePolicy):
     name = "random"
 
     def __init__(self, settings: Task | None = None, seed: int = 0) -> None:
-        """Seed the generator; see the class for the arguments."""
         self.settings = task_of(settings)
         check_seed(seed)
         self._rng = np.random.default_rng(seed)

@@ -83,7 +83,6 @@ class Regulator:
     """
 
     def __init__(self, task: Task, settings: Feedback | None = None) -> None:
-        """Remember the weights."""
         self.settings = settings or regulator_weights(task)
 
     def gains(self, by_state: FloatArray, by_control: FloatArray, times: FloatArray) -> FloatArray:
@@ -141,7 +140,6 @@ class Expert:
         metric: ContractionMetric | None = None,
         preference: Preference | None = None,
     ) -> None:
-        """Build planner and law."""
         self.task = task
         self.metric: ContractionMetric = metric_of(task) if metric is None else metric
         self.preference: Preference = preference or part_of(

@@ -54,7 +54,6 @@ class ResidualPolicy(BasePolicy):
         base: Path | str | None = None,
         allow_other_settings: bool = False,
     ) -> None:
-        """Load both networks; see the class for the arguments."""
         self.settings = task_of(settings)
         self.base = LagrosPolicy(self.settings, base, allow_other_settings)
         self.correction = Correction(self.settings, weights, allow_other_settings)

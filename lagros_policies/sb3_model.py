@@ -66,7 +66,6 @@ class StableBaselines3Policy(BasePolicy):
     def __init__(
         self, model: Any, name: str, settings: Described | None = None, **told: Any
     ) -> None:
-        """Wrap the model; see the class for the arguments."""
         task = _usual(told) if settings is None else settings
         wanted: Spaces = part_of(task, "SPACES", "lagros_policies.sb3_model:single_spaces")(
             task, **told
@@ -168,9 +167,6 @@ def detect_algorithm(path: Path | str) -> str:
     and these differ: only PPO has a `clip_range`, only SAC a `target_entropy`, only TD3 and DDPG a
     `target_policy_noise`. A2C shares its policy class with PPO alone. DDPG is the TD3 without
     delay and without clipped noise.
-
-    Args:
-        path: The zip file.
 
     Returns:
         One of `ALGORITHMS`.

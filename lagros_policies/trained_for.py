@@ -35,13 +35,9 @@ class Training:
     """What the networks of a task may fly: what they were trained for, setting by setting.
 
     A task whose networks may fly more names a class of its own in its room.
-
-    Args:
-        task: The task of the training.
     """
 
     def __init__(self, task: Task) -> None:
-        """Remember the task."""
         self.task = task
 
     def range(self, timed: bool) -> Range:
@@ -116,13 +112,7 @@ def check_weights(
 
 
 def weights_record(task: str, policy: str, trained_for: Range) -> dict[str, str]:
-    """Return the metadata of a weights file.
-
-    Args:
-        task: Name of the task.
-        policy: Name of the policy that flies it.
-        trained_for: What it may fly.
-    """
+    """Return the metadata of a weights file."""
     return {TASK: task, POLICY: policy, SETTINGS: json.dumps(trained_for, sort_keys=True)}
 
 

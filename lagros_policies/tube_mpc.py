@@ -89,7 +89,6 @@ class TubeMpcPolicy(BasePolicy):
         clock: Callable[[], float] = time.perf_counter,
         allow_other_settings: bool = False,
     ) -> None:
-        """Build planner and law."""
         self.settings = task = task_of(settings)
         check_whole("replan_every", replan_every)
         deadline = task.control_period if deadline is None else deadline

@@ -193,9 +193,6 @@ def _check(env: Any, inner: Any) -> None:
 def what_it_changes(kind: type) -> str | None:
     """Say what a class does that may change observations or actions.
 
-    Args:
-        kind: Of a wrapper, or of an environment.
-
     Returns:
         In words; None if it does nothing of the kind.
     """

@@ -142,12 +142,6 @@ def recorded_measure(
 ) -> StraightLine:
     """Record a measure alone: inputs x0... at the end of a step, u0..., g0....
 
-    Args:
-        system: The system.
-        measure: As in `recorded_hold`.
-        given: As in `recorded_hold`.
-        functions: As in `recorded_hold`.
-
     Returns:
         Its operations.
     """

@@ -64,7 +64,6 @@ class Recorded:
     __slots__ = ("name", "tape")
 
     def __init__(self, tape: Tape, name: str) -> None:
-        """Name a number."""
         self.tape, self.name = tape, name
 
     def __add__(self, other: Any) -> Recorded:

@@ -48,7 +48,6 @@ class Backend:
     address: str | None = None
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         if self.name not in BACKENDS:
             hint = suggestion(self.name, BACKENDS)

@@ -127,12 +127,6 @@ def run(
 ) -> Iterator[tuple[int, Outcome]]:
     """Yield index and result of every item, as `backends.each` does.
 
-    Args:
-        work: Called with each item, on a copy of its own.
-        items: The items.
-        jobs: Processes.
-        on_lost: Told how many chunks lost their worker.
-
     Raises:
         BackendError: A chunk lost too many workers.
     """
@@ -186,9 +180,6 @@ def limits(jobs: int) -> dict[str, str]:
     """Return the limits of a worker's threads: its share of the processors, as joblib gives it.
 
     A limit that is set for this process is kept.
-
-    Args:
-        jobs: Worker processes.
     """
     share = str(max(cpu_count() // jobs, 1))
     return {name: os.environ.get(name, share) for name in THREAD_LIMITS}

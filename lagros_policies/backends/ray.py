@@ -37,12 +37,6 @@ def run(
 ) -> Iterator[tuple[int, Outcome]]:
     """Yield index and result of every item, as `backends.each` does.
 
-    Args:
-        ray: The module, connected.
-        work: Called with each item.
-        items: The items.
-        on_lost: Told how many chunks lost their worker.
-
     Raises:
         BackendError: A chunk lost too many workers.
     """

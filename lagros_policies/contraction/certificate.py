@@ -141,7 +141,6 @@ class Stopwatch:
     """Seconds since it was last asked."""
 
     def __init__(self) -> None:
-        """Start."""
         self._begun = time.monotonic()
 
     def lap(self) -> float:

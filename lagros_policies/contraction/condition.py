@@ -40,10 +40,6 @@ _SLOPE_ERROR = 1e-6
 def condition_terms(system: System, samples: Samples) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return A(x, x_d, u_d), B(x) and dx/dt under u_d at samples of a system.
 
-    Args:
-        system: The system.
-        samples: The samples.
-
     Returns:
         A, shape (s, n, n), B, shape (s, n, m), and the motion, shape (s, n).
 
@@ -71,11 +67,6 @@ def condition_terms(system: System, samples: Samples) -> tuple[FloatArray, Float
 
 def condition_left(system: System, metric: DualMetric, samples: Samples) -> FloatArray:
     """Return -dW_bar/dt + 2 sym(A W_bar) - 2 nu B B' + 2 alpha W_bar at samples, (s, n, n).
-
-    Args:
-        system: The system.
-        metric: The metric.
-        samples: Where.
 
     Raises:
         ValueError: The three are not of one system.
@@ -159,11 +150,6 @@ def search_violation(system: System, metric: ContractionMetric, seed: int) -> tu
 
     Unlike `verify_metric` it follows the worst triples that it drew to where they are worse. Where
     control and state are bounded each for itself there are triples of which no plan is near.
-
-    Args:
-        system: The system.
-        metric: The metric.
-        seed: Seed of the search.
 
     Returns:
         The triples that the search ended at, the worst first, and the `contraction_residual` of

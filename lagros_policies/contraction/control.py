@@ -144,7 +144,6 @@ class HeldControl:
     period: float
 
     def __post_init__(self) -> None:
-        """Check system and rate."""
         size = len(self.metric.scaling)
         if size != self.system.state_dim:
             raise ValueError(

@@ -65,7 +65,6 @@ class CvStemSettings:
     point: Point = "state"
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         check_positive("contraction_rate", self.contraction_rate)
         check_whole("degree", self.degree, 0)

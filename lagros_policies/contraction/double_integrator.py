@@ -59,7 +59,6 @@ class AxisMetric:
     period: float = 0.1
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_positive("rate", self.rate)
         check_not_negative("period", self.period)
         check_positive("stiffness", self.stiffness)

@@ -83,7 +83,6 @@ class HeldDesign:
     aperiodic: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values."""
         positive = "period", "rate", "disturbance_bound", "control_penalty", "floor", "control_unit"
         check_fields(self, positive, not_negative=["margin"], least={"degree": 1})
 
@@ -238,11 +237,6 @@ def design_held(system: System, plan: Plans, error: FloatArray, design: HeldDesi
 
 def design_held_contained(system: System, plan: Plans, design: HeldDesign) -> HeldTube:
     """Design a tube on the errors that it allows itself: from none, until both meet.
-
-    Args:
-        system: The system.
-        plan: Where the target trajectories lie, some `Plans`.
-        design: What to design.
 
     Returns:
         A tube that is contained in the box of its condition.

@@ -148,7 +148,6 @@ class Metric:
     point: Point = "state"
 
     def __post_init__(self) -> None:
-        """Check the arrays."""
         shape = self.coefficients.shape
         fits = len(shape) == 3 and shape[1] == shape[2] and self.scaling.shape == shape[1:2]
         if not fits or 0 in shape:

@@ -47,7 +47,6 @@ class Samples:
     nominal_control: FloatArray
 
     def __post_init__(self) -> None:
-        """Check shapes and numbers."""
         shapes = [np.shape(getattr(self, item.name)) for item in fields(self)]
         if (
             [len(shape) for shape in shapes] != [2, 2, 2]
@@ -118,7 +117,6 @@ class BoxRegion:
     control_high: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        """Check the bounds."""
         check_fields(self)
         for name in ("low", "high", "error"):
             value = getattr(self, name)
@@ -208,7 +206,6 @@ class PlanRegion:
     error: FloatArray
 
     def __post_init__(self) -> None:
-        """Check the arrays."""
         for item in fields(self):
             array = np.array(getattr(self, item.name), dtype=np.float64)
             object.__setattr__(self, item.name, array)

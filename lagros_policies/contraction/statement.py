@@ -36,7 +36,6 @@ class Statement:
     refuted: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not self.text.strip():
             raise ValueError("text='' must say what is claimed")
         if self.kind not in get_args(Kind):
@@ -52,12 +51,7 @@ class Statement:
 
 
 def at_most(value: float, digits: int = 4) -> str:
-    """Return a number in words, rounded upwards: what is claimed is never less than was proved.
-
-    Args:
-        value: A bound from above.
-        digits: Significant digits.
-    """
+    """Return a number in words, rounded upwards: what is claimed is never less than was proved."""
     if not math.isfinite(value):
         return f"{value:g}"
     rounded = Context(prec=digits, rounding=ROUND_CEILING).create_decimal_from_float(value)

@@ -40,7 +40,6 @@ class Tube:
     initial_radius: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         check_positive("contraction_rate", self.contraction_rate)
         check_positive("condition", self.condition)
         check_at_least("condition", self.condition, 1)

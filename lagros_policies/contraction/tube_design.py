@@ -88,7 +88,6 @@ class PlanBounds:
     control_high: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        """Check the bounds."""
         self.with_errors(np.ones(len(self.low)))
 
     @property
@@ -158,7 +157,6 @@ class TubeDesign:
     margin: float = 0.05
 
     def __post_init__(self) -> None:
-        """Check the values."""
         positive = "rate", "disturbance_bound", "control_penalty", "floor"
         check_fields(self, positive, not_negative=["margin"])
         if self.method == "output" and self.output is None:
@@ -298,11 +296,6 @@ Contained = TypeVar("Contained", bound=TubeInBox)
 
 def design_contained(system: System, plan: Plans, design: TubeDesign) -> ConstantTube:
     """Design a tube on the errors that it allows itself: from none, until both meet.
-
-    Args:
-        system: The system.
-        plan: Where the target trajectories lie.
-        design: What to design.
 
     Returns:
         A tube that is contained in the box of its condition.

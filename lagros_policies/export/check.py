@@ -59,7 +59,6 @@ class CompiledPolicy:
     """
 
     def __init__(self, text: str, source: Source, flags: Sequence[str] = (*STRICT, "-O2")) -> None:
-        """Compile and load."""
         tool = compiler()
         if tool is None:
             raise FileNotFoundError("no C compiler (gcc, cc) is on the path; install one")

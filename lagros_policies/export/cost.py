@@ -73,11 +73,6 @@ def _tell(*command: str) -> str:
 def c_time(text: str, source: Source, flags: Sequence[str] = PLAIN) -> tuple[float, float]:
     """Return the times of one call of a C file and of NumPy's `predict` [s].
 
-    Args:
-        text: The C file.
-        source: The policy that it was made of.
-        flags: Flags of the compiler.
-
     Raises:
         FileNotFoundError: There is no compiler.
         RuntimeError: The compiler refuses the file.

@@ -44,9 +44,6 @@ Named = tuple[str, Sequence[str]]
 def onnx_file(source: Source) -> bytes:
     """Return the ONNX model of a policy.
 
-    Args:
-        source: The policy.
-
     Returns:
         A model of input "observation", shape (batch, o), as the environment gives it, and of one
         output, shape (batch, m), called as the control. The weights' name and digest, and what the

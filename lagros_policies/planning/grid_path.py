@@ -60,7 +60,6 @@ class GridSettings:
     most_search_cells: int = 40_000
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(
             self,
             positive=("cell", "search_cell", "search_period"),

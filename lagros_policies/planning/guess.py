@@ -50,17 +50,12 @@ class PlannerSettings:
     scp: ScpSettings = field(default_factory=_general)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         check_whole("attempts", self.attempts, 1)
 
 
 def plan_trajectory(problem: Problem, settings: PlannerSettings | None = None) -> Trajectory:
     """Plan from one guess after the other until a plan holds.
-
-    Args:
-        problem: What to plan.
-        settings: How to plan.
 
     Returns:
         The first plan that holds or, where none does, the one that comes closest; its `iterations`

@@ -125,15 +125,9 @@ def steps_left(task: Task, start_step: int, guess: Trajectory | None = None) -> 
 
 
 class TaskPlanner:
-    """Plans (x_d, u_d) of least effort that ends at the goal at the time limit.
-
-    Args:
-        task: The task.
-        settings: How to plan.
-    """
+    """Plans (x_d, u_d) of least effort that ends at the goal at the time limit."""
 
     def __init__(self, task: Task, settings: PlannerSettings | None = None) -> None:
-        """Remember task and settings."""
         self.task, self.settings = task, settings or PlannerSettings()
 
     def plan(

@@ -77,7 +77,6 @@ class ScpSettings:
     qp_solver: QpSolver = "piqp"
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         for item in fields(self):
             if item.name in ("disc_spare", "effort_tolerance"):

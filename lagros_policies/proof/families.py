@@ -64,10 +64,6 @@ class Violation:
 class BoxCondition:
     """Symmetric matrices on a set, for `cells.search`.
 
-    Args:
-        where: The set.
-        matrices: Which are to be negative definite.
-
     Attributes:
         moving: Which coordinates of the set matter; cells are of these alone.
 

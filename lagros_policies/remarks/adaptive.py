@@ -67,7 +67,6 @@ class AdaptiveControl:
     limit: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if not self.gain or not all(math.isfinite(g) and g >= 0.0 for g in self.gain):
             raise ValueError(f"gain={self.gain!r} must hold a finite number >= 0 for each unknown")
         if not 0.0 <= self.leakage * self.law.period < 1.0:

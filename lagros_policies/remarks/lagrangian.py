@@ -56,7 +56,6 @@ class SlidingAxis:
     period: float = 0.1
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for item in fields(self):
             check_positive(item.name, getattr(self, item.name))
         if self.position_rate * self.period >= 2.0:

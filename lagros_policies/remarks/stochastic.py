@@ -63,7 +63,6 @@ class MeanSquareBound:
     initial_energy: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         for name in ("rate", "least_eigenvalue"):
             check_positive(name, getattr(self, name))
         for name in ("power", "initial_energy"):

@@ -86,7 +86,6 @@ class BarrierSettings:
     blocked_speed: float = 0.14
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         may_be_zero = (
             "pair_margin",
@@ -158,7 +157,6 @@ class BrakingBarrier:
     period: float
 
     def __post_init__(self) -> None:
-        """Check the rates against the hold."""
         for name in ("pair_rate", "obstacle_rate"):
             rate = getattr(self.settings, name)
             if rate * self.period > 1.0:

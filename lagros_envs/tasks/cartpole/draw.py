@@ -60,7 +60,6 @@ class CartPoleRenderer(Canvas):
     """
 
     def __init__(self, task: CartPoleSettings, render_mode: str, fps: int) -> None:
-        """Prepare a canvas, and a window in the mode "human"."""
         super().__init__(render_mode, fps, (WIDTH, HEIGHT), task.env_id, (17, 20))
         self._half_length = task.system.half_length
         # (t, distance to the goal, radius) of the frames of this episode.

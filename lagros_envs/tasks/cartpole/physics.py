@@ -46,7 +46,6 @@ class CartPole:
     half_length: float = 0.5
 
     def __post_init__(self) -> None:
-        """Check that the parameters are physical."""
         check_fields(self)
         use_plain_numbers(self)
         for field in fields(self):

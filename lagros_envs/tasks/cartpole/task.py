@@ -77,7 +77,6 @@ class CartPoleSettings(Task):
     short_goal = (0,)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         use_plain_numbers(self)
         for item in fields(self):

@@ -33,7 +33,6 @@ class Pvtol:
     gravity: float = 9.81
 
     def __post_init__(self) -> None:
-        """Check that the parameters are physical."""
         check_fields(self)
         use_plain_numbers(self)
         for field in fields(self):

@@ -66,7 +66,6 @@ class SpacecraftRenderer(Canvas):
     """
 
     def __init__(self, render_mode: str, fps: int, arena: float) -> None:
-        """Prepare a canvas, and a window in the mode "human"."""
         size = (VIEW + PANEL, VIEW)
         super().__init__(render_mode, fps, size, "lagros/Spacecraft-v0", (15, 17, 20))
         self._arena = arena
@@ -76,9 +75,6 @@ class SpacecraftRenderer(Canvas):
 
     def draw(self, world: SpacecraftWorld) -> NDArray[np.uint8] | None:
         """Draw one frame of the first world.
-
-        Args:
-            world: The worlds, begun.
 
         Returns:
             The frame, shape (640, 840, 3), in the mode "rgb_array"; None in the mode "human".

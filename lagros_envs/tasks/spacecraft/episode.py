@@ -59,7 +59,6 @@ class SpacecraftEpisode:
         worlds: int = 1,
         compiled: bool | None = False,
     ) -> None:
-        """Build the worlds."""
         self.settings = settings_of(task.SpacecraftSettings(), settings)
         self.preset = preset_named(preset).for_agents(num_agents)
         self.disturbance = Disturbance(

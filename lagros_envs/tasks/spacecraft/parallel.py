@@ -125,7 +125,6 @@ class SpacecraftParallelEnv(OneWorld, ParallelEnv[str, Float32Array, Float32Arra
         max_cycles: int | None = None,
         render_mode: str | None = None,
     ) -> None:
-        """Build the environment; see the class for the arguments."""
         self.render_mode = check_render_mode(render_mode)
         settings = task.limited(settings_of(task.SpacecraftSettings(), settings), max_cycles)
         self.episode = SpacecraftEpisode(

@@ -42,7 +42,6 @@ class Spacecraft:
     side_arm: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check that the parameters are physical."""
         check_fields(self)
         use_plain_numbers(self)
         for field in fields(self):

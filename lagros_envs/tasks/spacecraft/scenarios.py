@@ -218,7 +218,6 @@ class Preset:
     grows: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(
             self,
             positive=("arena", "obstacle_radius", "agent_radius"),

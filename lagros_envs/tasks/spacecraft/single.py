@@ -59,7 +59,6 @@ class SpacecraftEnv(OneWorld, gym.Env[Float32Array, Float32Array]):
         settings: task.SpacecraftSettings | Mapping[str, Any] | None = None,
         render_mode: str | None = None,
     ) -> None:
-        """Build the environment; see the class for the arguments."""
         self.render_mode = check_render_mode(render_mode)
         self.episode = SpacecraftEpisode(
             1, preset, disturbance, disturbance_bound, disturbance_channels, metric, settings

@@ -97,7 +97,6 @@ class SpacecraftSettings(Described):
     )
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         use_plain_numbers(self)
         for item in fields(self):

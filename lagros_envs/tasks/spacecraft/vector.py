@@ -75,7 +75,6 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
     ) -> None:
-        """Build the worlds; see the class for the arguments."""
         check_whole("num_agents", num_agents)
         check_whole("num_envs", num_envs)
         if num_envs % num_agents:

@@ -78,7 +78,6 @@ class JointPlannerSettings:
     grid: GridSettings = field(default_factory=GridSettings)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(
             self,
             positive=("horizon", "control_period", "mass", "speed_limit", "check_period"),
@@ -113,14 +112,9 @@ class _Scene:
 
 
 class JointPlanner:
-    """Plans (x_d, u_d) of least effort for all agents together.
-
-    Args:
-        settings: The problem and how hard to look.
-    """
+    """Plans (x_d, u_d) of least effort for all agents together."""
 
     def __init__(self, settings: JointPlannerSettings | None = None) -> None:
-        """Remember the settings."""
         self.settings = settings or JointPlannerSettings()
 
     def plan(

@@ -42,7 +42,6 @@ class JointScpSettings:
     patience: int = 6
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         for item in fields(self):
             check_above(item.name, getattr(self, item.name), 0)

@@ -23,9 +23,6 @@ class ProgramLayout:
 
     Unknowns: per node the forces and states of all agents, then two per half-plane: by how much it
     is violated and by how much it is kept.
-
-    Args:
-        problem: What to plan.
     """
 
     def __init__(self, problem: JointProblem) -> None:

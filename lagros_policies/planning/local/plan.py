@@ -34,14 +34,9 @@ _DEARER = 5e-3
 
 
 class LocalPlanner:
-    """Plans the motion of one agent.
-
-    Args:
-        settings: How.
-    """
+    """Plans the motion of one agent."""
 
     def __init__(self, settings: LocalPlannerSettings | None = None) -> None:
-        """Remember the settings."""
         self.settings = settings or LocalPlannerSettings()
 
     def plan(

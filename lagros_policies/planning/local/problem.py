@@ -80,7 +80,6 @@ class LocalPlannerSettings:
     qp_tolerance: float = 1e-6
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(
             self,
             positive=("mass", "near_period", "speed_limit", "penalty", "qp_tolerance"),

@@ -50,7 +50,6 @@ class ProofBox:
     lean: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the bounds."""
         check_fields(self, not_negative=[item.name for item in fields(self)])
         if self.angle >= math.pi / 2:
             raise ValueError(f"angle={self.angle!r} must be below pi/2")

@@ -363,13 +363,7 @@ def _constant_line(system: CartPole, tube: ConstantTube, most_seconds: float) ->
 
 
 def draw_region(rng: np.random.Generator, box: ProofBox, count: int) -> Samples:
-    """Draw triples (x, x_d, u_d) of a box, e = x - x_d not zero; the lean is left out.
-
-    Args:
-        rng: Random generator.
-        box: The box.
-        count: Triples.
-    """
+    """Draw triples (x, x_d, u_d) of a box, e = x - x_d not zero; the lean is left out."""
     half = np.zeros(4)
     half[[0, ANGLE, VELOCITY, ANGULAR_RATE]] = 1.0, box.angle, box.velocity, box.angular_rate
     reach = np.array([1.0, box.angle_error, 2.0 * box.velocity, box.angular_rate_error])

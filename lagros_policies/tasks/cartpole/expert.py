@@ -27,6 +27,5 @@ class CartPoleExpert(Expert):
         task: CartPoleSettings | None = None,
         feedback: FeedbackSettings | None = None,
     ) -> None:
-        """Build planner and law."""
         task = task or CartPoleSettings()
         super().__init__(task, metric, GatedRegulator(task, feedback))

@@ -19,11 +19,7 @@ _STATE, _GOAL, _START = task.STATE.start, task.GOAL.start, task.INITIAL_STATE.st
 
 
 class CartPoleView:
-    """What the networks see, see above; the sign is the side.
-
-    Args:
-        settings: The task, of which nothing is needed.
-    """
+    """What the networks see, see above; the sign is the side."""
 
     names = (
         "position - goal [m]",

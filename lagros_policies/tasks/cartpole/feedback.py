@@ -44,7 +44,6 @@ class WeightSchedule:
     decay_time: float = 0.35
 
     def __post_init__(self) -> None:
-        """Check the shapes."""
         if len(self.state) != len(self.control) or not self.decay_time > 0.0:
             raise ValueError(
                 f"{len(self.state)} rows of state weights need as many control weights, "
@@ -103,7 +102,6 @@ class FeedbackSettings:
     tube: PaperTube = field(default_factory=PaperTube)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         check_whole("lookahead", self.lookahead)
 
@@ -218,7 +216,6 @@ class GatedRegulator:
     """
 
     def __init__(self, task: CartPoleSettings, settings: FeedbackSettings | None = None) -> None:
-        """Remember the weights."""
         self.settings = settings or FeedbackSettings(tube=task.tube)
         self._period = task.control_period
 

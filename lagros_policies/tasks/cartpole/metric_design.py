@@ -53,7 +53,6 @@ class MetricDesignSettings:
     region: Region = field(default_factory=Region)
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         check_fields(self, least={"plans": 1, "pool": 1, "checks": 1})
         check_seed(self.seed)
 
@@ -67,10 +66,6 @@ def design_cartpole_metric(
     task_settings: task.CartPoleSettings | None = None,
 ) -> Metric:
     """Design the cart-pole's metric and verify it on fresh states around fresh plans.
-
-    Args:
-        settings: What to design.
-        task_settings: The task.
 
     Returns:
         The metric with its verification (observed, not proved).
@@ -94,12 +89,6 @@ def tube_samples(
     count: int,
 ) -> Samples:
     """Draw triples (x, x_d, u_d) of the region around the plans of random episodes.
-
-    Args:
-        settings: Plans, seed and region.
-        task_settings: The task.
-        namespace: Which episodes.
-        count: Triples to return.
 
     Returns:
         The triples.

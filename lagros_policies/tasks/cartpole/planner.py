@@ -43,7 +43,6 @@ class CartPolePlannerSettings:
     scp: ScpSettings = field(default_factory=ScpSettings)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         if not 0.0 <= self.angle_margin < FALL_ANGLE:
             raise ValueError(f"angle_margin={self.angle_margin!r} must be in [0, pi/2)")
@@ -63,7 +62,6 @@ class CartPolePlanner:
         task: CartPoleSettings | None = None,
         settings: CartPolePlannerSettings | None = None,
     ) -> None:
-        """Remember task and settings."""
         self.task = task or CartPoleSettings()
         self.settings = settings or CartPolePlannerSettings()
         high = np.full((self.task.steps, STATE_DIM), np.inf)

@@ -39,7 +39,6 @@ class PlanBox:
     force: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the bounds."""
         check_fields(self, not_negative=[item.name for item in fields(self)])
 
     @property

@@ -73,7 +73,6 @@ class ProvedDesignSettings:
     most_seconds: float = 60.0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         check_fields(self)
         if self.rounds < 1 or not (self.period > 0.0 and self.most_seconds > 0.0):
             raise ValueError("rounds must be at least 1, period and most_seconds positive")

@@ -47,7 +47,6 @@ class Region:
     scaling: ClassVar[tuple[float, ...]] = (1.0, 12.0, 1.0, 1.5)
 
     def __post_init__(self) -> None:
-        """Check the bounds."""
         for item in fields(self):
             check_positive(item.name, getattr(self, item.name))
         if self.angle >= math.pi / 2:

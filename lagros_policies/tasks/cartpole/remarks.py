@@ -94,7 +94,6 @@ class NeuralTubeMpcPolicy(TubeMpcPolicy):
         allow_other_settings: bool = False,
         **planning: Any,
     ) -> None:
-        """Read the network and build planner and law."""
         if metric is None:
             check_own_metric(settings_of(task.CartPoleSettings(), settings), allow_other_settings)
         super().__init__(settings, load_neural_metric(metric), **planning)
@@ -146,7 +145,6 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
         metric: ContractionMetric | str | Path | None = None,
         **planning: Any,
     ) -> None:
-        """Build planner, law and adaptation."""
         super().__init__(settings, metric, **planning)
         law = self.expert.law
         # A function of the module, so that the policy can be pickled.

@@ -19,11 +19,7 @@ _LEAN = INITIAL_STATE.start + ANGLE
 
 
 class CartPoleTraining(Training):
-    """What a network that was trained for a task may fly.
-
-    Args:
-        task: The task.
-    """
+    """What a network that was trained for a task may fly."""
 
     task: CartPoleSettings
 

@@ -139,7 +139,6 @@ class CentralizedPolicy(BasePolicy):
         margin: float | None = None,
         planner: JointPlannerSettings | None = None,
     ) -> None:
-        """Build planner and law."""
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.agents = self.preset.agents
         self.obstacles = max(1, self.preset.obstacle_count[1])

@@ -129,7 +129,6 @@ class DistributedTubeMpcPolicy(BasePolicy):
         smoothing: float = 0.7,
         planner: LocalPlannerSettings | None = None,
     ) -> None:
-        """Build planner and law."""
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
         check_whole("replan_every", replan_every)

@@ -54,7 +54,6 @@ class SpacecraftExpertSettings:
     side_preference: float = 0.25
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self, positive=[item.name for item in fields(self)])
 
 
@@ -73,7 +72,6 @@ class SpacecraftExpert:
         settings: SpacecraftExpertSettings,
         task: SpacecraftSettings,
     ) -> None:
-        """Build planner and law; `plan` must be called for every world before `acceleration`."""
         self.scenarios, self.settings, self.task = scenarios, settings, task
         period = task.control_period
         self.tracking = WrenchTracking.for_rates(

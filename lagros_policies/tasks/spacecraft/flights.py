@@ -76,7 +76,6 @@ class FlightSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         if self.worlds_per_shard < 1 or self.worlds < 1 or self.worlds % self.worlds_per_shard:
             raise ValueError(

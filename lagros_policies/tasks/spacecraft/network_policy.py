@@ -70,7 +70,6 @@ class SpacecraftActor(BasePolicy):
         weights: Path | str | DeepSet | Mlp | None = None,
         allow_other_settings: bool = False,
     ) -> None:
-        """Load the network."""
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
         given = PRETRAINED / self.weights_file if weights is None else weights

@@ -53,9 +53,6 @@ class AxisProof:
 def control_square(body: Spacecraft) -> tuple[Fraction, Fraction, Fraction] | None:
     """Return the diagonal of the velocities' block of B B' if it is one at every heading.
 
-    Args:
-        body: The spacecraft.
-
     Returns:
         The diagonal, exactly; None if B B' depends on the heading, is not diagonal, reaches the
         positions, or the free motion is not uniform.

@@ -83,7 +83,6 @@ class SafetyFilter(BasePolicy):
         disturbance_bound: float = 0.4,
         barrier: BarrierSettings | None = None,
     ) -> None:
-        """Build the barrier."""
         self.policy = as_policy(policy)
         self.name = f"{self.policy.name}+filter"
         self.observes = self.policy.observes

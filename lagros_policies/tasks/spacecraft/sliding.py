@@ -63,7 +63,6 @@ class SlidingCentralizedPolicy(CentralizedPolicy):
         turning_rate: float = 0.3,
         margin: float | None = None,
     ) -> None:
-        """Build planner and law."""
         super().__init__(settings, preset, num_agents, disturbance_bound, margin=margin)
         period = self.settings.control_period
         check_positive("turning_rate", turning_rate)

@@ -45,7 +45,6 @@ class HeldBall:
     metric: AxisMetric
 
     def __post_init__(self) -> None:
-        """Check the period."""
         if self.metric.period == 0.0:
             raise ValueError("a held control needs a metric with a period")
 
@@ -112,7 +111,6 @@ class AxesTracking:
     turning: Any
 
     def __post_init__(self) -> None:
-        """Check the periods."""
         check_spacecraft(self.body, type(self).__name__)
         if self.plane.period != self.turning.period or self.plane.period == 0.0:
             raise ValueError(

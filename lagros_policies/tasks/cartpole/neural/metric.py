@@ -70,7 +70,6 @@ class NeuralMetric:
     verification: Verification | None = None
 
     def __post_init__(self) -> None:
-        """Check network and numbers."""
         if (self.network.inputs, self.network.outputs) != (1, OUTPUTS):
             raise ValueError(
                 f"the network has {self.network.inputs} inputs and {self.network.outputs} outputs; "

@@ -67,7 +67,6 @@ class NeuralTrainingSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         check_fields(
             self,
             positive=["learning_rate"],
