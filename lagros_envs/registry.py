@@ -72,17 +72,16 @@ def find_task(text: str) -> Described:
     Raises:
         ValueError: There is no such task, or something is wrong with it.
     """
+    if text in task_names():
+        return task_named(text)
     found = _found(text)
-    if found.name not in (text, *SHIPPED):
-        _CALLED[found.name] = text
+    _CALLED[found.name] = text
     return found
 
 
 def _found(text: str) -> Described:
     from importlib.metadata import entry_points
 
-    if text in task_names():
-        return task_named(text)
     for point in entry_points(group=ENTRY_POINTS, name=text):
         return _registered(_made(_loaded(point.value), f"the entry point {text!r}"))
     place, colon, attribute = text.rpartition(":")

@@ -93,6 +93,7 @@ def test_a_task_of_an_installed_package_is_found(tmp_path, monkeypatch):
     (metadata / "entry_points.txt").write_text("[lagros.tasks]\nslab = installed_puck:Puck\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     assert find_task("slab").title == "Slab"
+    assert called(find_task("slab")) == "slab"
     assert "slab" in task_names()
 
 
