@@ -18,6 +18,10 @@ from lagros_envs.numbers.interval import Interval, exact
 Number = Union["Series", Dual, Interval, FloatArray, float]
 
 
+class KinkError(ZeroDivisionError):
+    """A derivative is asked for where there is none."""
+
+
 class Series:
     """A function of one variable near a point or over an interval of it: f, f', f''/2, f'''/6 ...
 
@@ -107,16 +111,21 @@ class Series:
         """Raise to an integer power."""
         return power(self, exponent)
 
-    def __abs__(self) -> Series:
-        """Return the series itself or its negative.
+    def sign(self) -> FloatArray:
+        """Return the sign, which does not change.
 
         Raises:
-            ValueError: The function may be zero, where its absolute value has no derivative.
+            KinkError: The function may be zero, where its absolute value has no derivative.
         """
         sign = self.parts[0].sign()
         if np.any(sign.lower * sign.upper <= 0.0):
-            raise ValueError("abs of a series around zero has no derivative: use smaller intervals")
-        return Series([part * sign.lower for part in self.parts])
+            raise KinkError("abs of a series around zero has no derivative: use smaller intervals")
+        return sign.lower
+
+    def __abs__(self) -> Series:
+        """Return the series itself or its negative; see `sign`."""
+        sign = self.sign()
+        return Series([part * sign for part in self.parts])
 
     def sin(self) -> Series:
         """Return the sine."""

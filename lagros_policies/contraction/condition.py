@@ -60,7 +60,8 @@ def condition_terms(system: System, samples: Samples) -> tuple[FloatArray, Float
         worst = int(np.argmax((missed / size).max(axis=1)))
         raise ValueError(
             f"the slope of {system!r} changes too often between x={state[worst].tolist()} and "
-            f"x_d={nominal[worst].tolist()} for its mean to be known: bring the two nearer"
+            f"x_d={nominal[worst].tolist()} for its mean to be known: bring the two nearer, "
+            "or round the bends of its equation, abs(v) as functions.sqrt(v*v + 1e-4)"
         )
     return slope, control_matrix(system, state), motion
 

@@ -36,6 +36,17 @@ def test_what_works_on_every_kind_of_number_passes(system):
     check_system(system)
 
 
+def test_a_drag_that_bends_at_rest_is_no_fault():
+    """|v| v has no second derivative at rest: it flies and plans, and no proof reaches over it."""
+
+    def drag(self, x, u, f):
+        return x[1], u[0] - 0.3 * abs(x[1]) * x[1]
+
+    system = type("Boat", (Pendulum,), {"derivative": drag})()
+    rest = np.array([[0.5, 0.0], [0.1, 0.3]])
+    check_system(system, rest, np.ones((2, 1)))
+
+
 def faulty(derivative, **attributes):
     return type("Mine", (Pendulum,), {"derivative": derivative, **attributes})()
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lagros_envs.dynamics import hold_step
+from lagros_envs.dynamics import check_system, hold_step
 from lagros_envs.numbers import Interval, exact
 from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.pvtol.physics import Pvtol as Planar
@@ -379,3 +379,21 @@ def test_a_tube_of_a_held_car_is_designed_and_proved():
     assert prove_held_tube(Car(), tube).proved
     wider = replace(tube, design=replace(design, disturbance_bound=0.2))
     assert not prove_held_tube(Car(), wider).proved
+
+
+def test_no_proof_reaches_over_a_bend_and_one_beside_it_is_found():
+    """|v| v has no second derivative at v = 0; it flies and plans all the same."""
+
+    class Boat:
+        state_dim, control_dim = 2, 1
+
+        def derivative(self, x, u, functions):
+            return x[1], u[0] - 0.3 * abs(x[1]) * x[1]
+
+    check_system(Boat(), np.zeros((1, 2)), np.ones((1, 1)))
+    weights = np.array([[[1.0, -1.0], [-1.0, 2.0]]])
+    for low, proved in ((-1.0, False), (1.0, True)):
+        box = BoxRegion((-1.0, low), (1.0, 2.0), (0.1, 0.1), (-1.0,), (1.0,))
+        metric = Metric(weights, 0.3, 50.0, 9.0, np.ones(2), box)
+        found = prove_contraction(Boat(), metric, box, most_boxes=2000)
+        assert (found.proved, found.refuted) == (proved, False)
