@@ -48,7 +48,7 @@ def run(
         errors.OutOfMemoryError,
     )
     # We run again what is lost: Ray would do it in silence.
-    remote = ray.remote(max_retries=0)(_call)
+    remote = ray.remote(max_retries=0)(sheltered)
     shared = ray.put(work)
     begun = {remote.remote(shared, item): (index, 1) for index, item in enumerate(items)}
     try:
@@ -69,10 +69,6 @@ def run(
     finally:
         for reference in begun:
             ray.cancel(reference, force=True)
-
-
-def _call(work: Callable[[Item], Outcome], item: Item) -> Outcome:
-    return sheltered(work, item)
 
 
 @contextmanager

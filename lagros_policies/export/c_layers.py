@@ -52,7 +52,10 @@ def _wide(name: str, weight: Float32Array, bias: Float32Array, activation: Activ
     parts = [("", split, 0), ("_rest", outputs - split, split)]
     parts = [part for part in parts if part[1]]
     paired = inputs - inputs % 2
-    arrays = [_array_of_part(name, weight, part) for part in parts]
+    arrays = [
+        array(f"{name}_weight{end}", weight[:, first : first + width])
+        for end, width, first in parts
+    ]
     sums = ", ".join(f"even{end}[{width}], odd{end}[{width}]" for end, width, _ in parts)
     steps = ", ".join(f"row{end} += {2 * width}" for end, width, _ in parts)
     lines = [
@@ -164,11 +167,6 @@ def _horner(coefficients: tuple[float, ...]) -> str:
     for value in coefficients[-2::-1]:
         text = f"{literal(value)} + s * ({text})"
     return text
-
-
-def _array_of_part(name: str, weight: Float32Array, part: tuple[str, int, int]) -> str:
-    end, width, first = part
-    return array(f"{name}_weight{end}", weight[:, first : first + width])
 
 
 def _index(variable: str, offset: int) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 from lagros_envs.arrays import Float32Array
@@ -117,7 +118,7 @@ class Program:
     @cached_property
     def looking(self) -> StraightLine:
         """`look`, recorded: features, then context; what is read and NaN makes the first NaN."""
-        record = straight_line(lambda given: _joined(*self.look(given)), self.places)
+        record = straight_line(lambda given: [*chain(*self.look(given))], self.places)
         hidden = [place for place in _read(record) if not _noticed(record, place)]
 
         def look(given: Numbers) -> Numbers:
@@ -193,10 +194,6 @@ def is_bound(line: StraightLine, operation: Any) -> bool:
     condition, yes, no = operation.operands
     tested = line.operations.get(condition)
     return tested is not None and tested.symbol in ("<=", ">") and tested.operands == (no, yes)
-
-
-def _joined(features: Numbers, context: Numbers) -> list[Any]:
-    return [*features, *context]
 
 
 def _read(line: StraightLine) -> list[str]:

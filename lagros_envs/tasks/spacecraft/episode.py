@@ -32,14 +32,10 @@ from lagros_envs.tasks.spacecraft.world import Outcome, SpacecraftWorld
 class SpacecraftEpisode:
     """Worlds, and how an episode starts in them.
 
+    The arguments from `preset` to `settings` are those of `SpacecraftParallelEnv`.
+
     Args:
         num_agents: Number of agents; None for the preset's own.
-        preset: As in `SpacecraftParallelEnv`.
-        disturbance: As in `SpacecraftParallelEnv`.
-        disturbance_bound: As in `SpacecraftParallelEnv`.
-        disturbance_channels: As in `SpacecraftParallelEnv`.
-        metric: As in `SpacecraftParallelEnv`.
-        settings: As in `SpacecraftParallelEnv`.
         worlds: Number of worlds.
         compiled: As in `SpacecraftWorld`.
 

@@ -56,7 +56,7 @@ def way_exists(
     first, last = np.split(cells, 2)
     outside = flood(free, (0, 0))
     return all(
-        _same(outside, start, goal) or flood(free, start)[goal]
+        (outside[start] and outside[goal]) or flood(free, start)[goal]
         for start, goal in zip(map(tuple, first), map(tuple, last), strict=True)
     )
 
@@ -68,10 +68,6 @@ def _all_free(ends: FloatArray, centres: FloatArray, radii: FloatArray) -> bool:
     away = np.sum((ends[:, None] - centres) ** 2, axis=-1)
     disjoint = np.all(apart >= (radii[:, None] + radii) ** 2)
     return bool(disjoint and np.all(away >= radii**2))
-
-
-def _same(outside: BoolArray, start: tuple[int, ...], goal: tuple[int, ...]) -> bool:
-    return bool(outside[start] and outside[goal])
 
 
 def flood(free: BoolArray, origin: tuple[int, ...]) -> BoolArray:

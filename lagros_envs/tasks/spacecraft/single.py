@@ -33,13 +33,9 @@ class SpacecraftEnv(OneWorld, gym.Env[Float32Array, Float32Array]):
     `reset(options=...)` takes `scenario`, a `tasks.spacecraft.scenarios.Scenario` of one agent,
     and `nominal`, x_d at every control instant, shape (steps + 1, 6).
 
+    The arguments from `preset` to `settings` are those of `SpacecraftParallelEnv`.
+
     Args:
-        preset: As in `SpacecraftParallelEnv`.
-        disturbance: As in `SpacecraftParallelEnv`.
-        disturbance_bound: As in `SpacecraftParallelEnv`.
-        disturbance_channels: As in `SpacecraftParallelEnv`.
-        metric: As in `SpacecraftParallelEnv`.
-        settings: As in `SpacecraftParallelEnv`.
         render_mode: None, "human" or "rgb_array".
 
     Raises:

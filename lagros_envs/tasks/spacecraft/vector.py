@@ -35,18 +35,13 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
     also takes `scenarios` (one `Scenario` or None per world) and `nominal` (worlds, steps + 1,
     num_agents, 6).
 
+    The arguments from `preset` to `settings` are those of `SpacecraftParallelEnv`, and
+    `max_episode_steps` and `autoreset_mode` those of `autoreset.RestartingVectorEnv`.
+
     Args:
         num_envs: Number of rows, a multiple of `num_agents`.
         num_agents: Agents in each world.
-        preset: As in `SpacecraftParallelEnv`.
-        disturbance: As in `SpacecraftParallelEnv`.
-        disturbance_bound: As in `SpacecraftParallelEnv`.
-        disturbance_channels: As in `SpacecraftParallelEnv`.
-        metric: As in `SpacecraftParallelEnv`.
-        settings: The task.
         compiled: As in `CartPoleVectorEnv`.
-        max_episode_steps: As in `autoreset.RestartingVectorEnv`.
-        autoreset_mode: As in `autoreset.RestartingVectorEnv`.
         render_mode: Must be None; render a single environment instead.
 
     Attributes:

@@ -92,7 +92,8 @@ def solve_joint(
     """
     layout = ProgramLayout(problem)
     places = guess
-    states, forces = _rest(problem)
+    n, nodes = len(problem.starts), problem.nodes
+    states, forces = np.repeat(problem.starts[:, None], nodes + 1, axis=1), np.zeros((n, nodes, 2))
     effort = violation = np.inf
     best, stale = np.inf, 0
     status = f"distances not met in {settings.max_iterations} quadratic programs"
@@ -126,8 +127,3 @@ def solve_joint(
         best = min(best, violation)
     solved = violation <= settings.distance_tolerance
     return JointSolution(states, forces, solved, status, float(violation), iterations)
-
-
-def _rest(problem: JointProblem) -> tuple[FloatArray, FloatArray]:
-    n, nodes = len(problem.starts), problem.nodes
-    return np.repeat(problem.starts[:, None], nodes + 1, axis=1), np.zeros((n, nodes, 2))

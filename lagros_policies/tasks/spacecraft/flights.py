@@ -156,7 +156,7 @@ def fly_expert(
     record = {
         "flights": asdict(settings),
         "task": asdict(task),
-        "learner": None if learner is None else _digest(learner),
+        "learner": None if learner is None else hashlib.sha256(learner.read_bytes()).hexdigest(),
     }
     shards = make_shards(folder, settings.shards, make, record, jobs, on_shard, backend)
     observation, acceleration, world = (
@@ -271,7 +271,3 @@ def _age(settings: FlightSettings, task: SpacecraftSettings, step: int, worlds: 
     turn = step + np.arange(worlds) * every // worlds
     age: IntArray = np.where(turn >= every, turn % every, -1)
     return age
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
