@@ -41,9 +41,6 @@ def write_atomic(path: str | Path, data: str | bytes) -> Path:
         path: The file; its folder is made if need be.
         data: Text (written as UTF-8, with what UTF-8 lacks escaped as in JSON) or bytes.
 
-    Returns:
-        The path.
-
     Raises:
         OSError: It cannot be written, or is a folder, a socket or a block device.
     """

@@ -164,9 +164,6 @@ class Expert:
             states: x_d, shape (p, N + 1, n).
             controls: u_d, shape (p, N, m).
             first_step: Control step at which the plans begin.
-
-        Returns:
-            The plans with their gains.
         """
         period = self.task.control_period
         _, by_state, by_control = linearise_hold(self.task.system, states[:, :-1], controls, period)

@@ -140,11 +140,7 @@ def recorded_hold(
 def recorded_measure(
     system: System, measure: Measure, given: int = 0, functions: Any = elementary
 ) -> StraightLine:
-    """Record a measure alone: inputs x0... at the end of a step, u0..., g0....
-
-    Returns:
-        Its operations.
-    """
+    """Record a measure alone: inputs x0... at the end of a step, u0..., g0...."""
     n, m = system.state_dim, system.control_dim
     sizes = {"x": n, "u": m, "g": given}
     names = [f"{kind}{k}" for kind, count in sizes.items() for k in range(count)]

@@ -124,9 +124,6 @@ def verify_metric(system: System, metric: Verified, samples: Samples, seed: int)
         samples: States that the design never saw.
         seed: The seed they were drawn with, for the record.
 
-    Returns:
-        The metric with its `verification`.
-
     Raises:
         ValueError: There is no sample, or they or the metric are not those of the system.
     """

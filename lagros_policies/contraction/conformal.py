@@ -109,9 +109,6 @@ def conformal_bound(
         confidence: None for c on average over calibration sets; otherwise the confidence, over
             calibration sets, with which the share of fresh episodes below the bound is at least c.
 
-    Returns:
-        The bound.
-
     Raises:
         ValueError: A score is not a number, or there are too few for the level.
     """

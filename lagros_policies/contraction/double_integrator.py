@@ -143,9 +143,6 @@ def design_axis(
         stiffness_limit: Largest s [1/s^2]. The position's tube asks for a stiff metric, which pays
             in effort; without a hold it asks for an infinite one.
 
-    Returns:
-        The metric.
-
     Raises:
         ValueError: No stiffness below the limit is admissible, or none is best.
     """

@@ -79,9 +79,6 @@ def prove_tube(system: System, tube: ConstantTube, most_seconds: float = 60.0) -
         tube: The tube.
         most_seconds: Time after which the search gives up [s].
 
-    Returns:
-        The proof.
-
     Raises:
         TypeError: The system is not that of the tube.
     """

@@ -196,9 +196,6 @@ def design_held(system: System, plan: Plans, error: FloatArray, design: HeldDesi
         error: Largest |x - x_d|, shape (n,).
         design: What to design.
 
-    Returns:
-        The tube.
-
     Raises:
         TypeError: The system is not that of the plans.
         InfeasibleError: There is no such tube.
@@ -237,9 +234,6 @@ def design_held(system: System, plan: Plans, error: FloatArray, design: HeldDesi
 
 def design_held_contained(system: System, plan: Plans, design: HeldDesign) -> HeldTube:
     """Design a tube on the errors that it allows itself: from none, until both meet.
-
-    Returns:
-        A tube that is contained in the box of its condition.
 
     Raises:
         InfeasibleError: The errors outgrow the box on which there is a tube.

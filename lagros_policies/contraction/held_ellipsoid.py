@@ -65,9 +65,6 @@ def prove_held_tube(system: System, tube: HeldTube, most_seconds: float = 60.0) 
         tube: The tube.
         most_seconds: Processor time after which each of N + 1 searches gives up [s].
 
-    Returns:
-        The proof.
-
     Raises:
         TypeError: The system is not that of the tube.
     """

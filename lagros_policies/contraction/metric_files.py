@@ -165,9 +165,6 @@ def load_metric(path: Path | str, states: int | None = None) -> Metric:
         path: A file written by `save_metric`.
         states: Of how many states it must be; None for any number.
 
-    Returns:
-        The metric.
-
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file is not a metric, is a network, is damaged, or of other states.

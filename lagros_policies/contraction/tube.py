@@ -134,9 +134,6 @@ def tighten(low: FloatArray, high: FloatArray, radius: FloatArray) -> tuple[Floa
         high: Upper bounds, likewise.
         radius: Tube radius, broadcast against them.
 
-    Returns:
-        The bounds that the target trajectory must keep.
-
     Raises:
         ValueError: The tube is wider than the interval, or its radius negative or no number.
     """

@@ -258,9 +258,6 @@ def design_constant(
         error: Largest |x - x_d|, shape (n,).
         design: What to design.
 
-    Returns:
-        The tube.
-
     Raises:
         TypeError: The system is not that of the plans.
         InfeasibleError: There is no such constant metric.
@@ -296,9 +293,6 @@ Contained = TypeVar("Contained", bound=TubeInBox)
 
 def design_contained(system: System, plan: Plans, design: TubeDesign) -> ConstantTube:
     """Design a tube on the errors that it allows itself: from none, until both meet.
-
-    Returns:
-        A tube that is contained in the box of its condition.
 
     Raises:
         InfeasibleError: The errors outgrow the box on which there is a metric.

@@ -121,9 +121,6 @@ def straighten(path: FloatArray, obstacles: FloatArray, distance: FloatArray) ->
         path: Polyline, shape (points, 2) [m].
         obstacles: Centres, shape (m, 2) [m].
         distance: To be kept from each centre, shape (m,) [m]; less where the path itself is nearer.
-
-    Returns:
-        The polyline with some points left out, both ends kept.
     """
     gaps = np.linalg.norm(path[:, None] - obstacles, axis=-1)
     kept = [0]

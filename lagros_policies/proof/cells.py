@@ -86,9 +86,6 @@ def search(
         most_cells: Cells after which the search gives up.
         most_seconds: Processor time of this thread after which it gives up [s], so that a busy
             machine does not turn a proof into none.
-
-    Returns:
-        The outcome.
     """
     start, begun = time.monotonic(), time.thread_time()
     waiting = condition.start()

@@ -150,9 +150,6 @@ def hierarchical_bound(
         initial_sliding: ||s|| at the start.
         initial_error: ||q~|| at the start.
 
-    Returns:
-        The bounds.
-
     Raises:
         ValueError: A number is negative.
     """

@@ -200,9 +200,6 @@ def held_mean_square(
         steps: N.
         axes: Axes that share the metric: x and y.
 
-    Returns:
-        The bounds.
-
     Raises:
         ValueError: The metric has no period, or a number is negative.
     """

@@ -93,9 +93,6 @@ class Spacecraft:
             state: As in `derivative`.
             wrench: [force, force, torque] as `wrench` returns it.
             functions: As in `derivative`.
-
-        Returns:
-            The six rates.
         """
         _, _, heading, velocity_x, velocity_y, spin = state
         first, second, torque = wrench

@@ -27,9 +27,6 @@ def way_exists(
         radii: Their radii, inflated by whoever has to pass, shape (k,) [m].
         cell: Side of a cell [m].
 
-    Returns:
-        True if each start has a way to its own goal.
-
     Raises:
         ValueError: The grid would have too many cells.
     """

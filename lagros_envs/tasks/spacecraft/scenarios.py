@@ -268,9 +268,6 @@ class Preset:
             rng: The scenario stream of the episode.
             num_agents: Number of agents; None for the preset's own.
 
-        Returns:
-            The scenario.
-
         Raises:
             ValueError: No attempt met the density that is asked for.
         """

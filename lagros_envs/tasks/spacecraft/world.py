@@ -177,9 +177,6 @@ class SpacecraftWorld:
 
         Args:
             forces: u >= 0, shape (worlds, agents, 8) [N].
-
-        Returns:
-            The outcome, per agent.
         """
         settings = self.settings
         before = self.goal_distance

@@ -135,9 +135,6 @@ def gain_table(
         by_control: dF/du, shape (p, N, n).
         times: Control instants of the plans, shape (N + 1,) [s].
 
-    Returns:
-        The table.
-
     Raises:
         ValueError: The plans have more than one control, or other states than there are weights.
     """

@@ -67,9 +67,6 @@ def design_cartpole_metric(
 ) -> Metric:
     """Design the cart-pole's metric and verify it on fresh states around fresh plans.
 
-    Returns:
-        The metric with its verification (observed, not proved).
-
     Raises:
         InfeasibleError: No such metric exists.
         RuntimeError: The solver stopped, or the pool was not satisfied.
@@ -88,11 +85,7 @@ def tube_samples(
     namespace: int,
     count: int,
 ) -> Samples:
-    """Draw triples (x, x_d, u_d) of the region around the plans of random episodes.
-
-    Returns:
-        The triples.
-    """
+    """Draw triples (x, x_d, u_d) of the region around the plans of random episodes."""
     planner = CartPolePlanner(task_settings)
     states, controls = [], []
     for seed in episode_seeds(settings.seed, settings.plans, namespace):

@@ -77,9 +77,6 @@ def prove_axis(metric: AxisMetric) -> AxisProof:
 
     Args:
         metric: W = [[1, q], [q, s]], rate and period.
-
-    Returns:
-        The proof; it holds or it does not.
     """
     rate = Fraction(metric.rate) * (1 - _SHORTFALL)
     coupling, stiffness = Fraction(metric.coupling), Fraction(metric.stiffness)

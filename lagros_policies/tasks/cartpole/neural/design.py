@@ -100,9 +100,6 @@ def solve_at_angles(
         settings: Rate, margin, weight of nu and scaling; the degree is not used.
         angles: Number of angles, from 0 to the region's largest.
 
-    Returns:
-        The solution.
-
     Raises:
         TypeError: The system is no cart-pole.
         InfeasibleError: There is none.
@@ -177,9 +174,6 @@ def solve_on_pool(
         angles: Number of angles.
         first: Triples to begin with, and to add in a round at most.
         rounds: Programs at most.
-
-    Returns:
-        The last solution.
 
     Raises:
         InfeasibleError: There is none.

@@ -179,9 +179,6 @@ def load_neural_metric(path: Path | str | None = None) -> NeuralMetric:
     Args:
         path: A file written by `save_neural_metric`; None for the shipped one.
 
-    Returns:
-        The metric.
-
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file is not such a metric, or is damaged.
