@@ -50,6 +50,11 @@ class Statement:
         return "not shown" if self.kind == "proved" and not self.refuted else "NO"
 
 
+def at_least(value: float, digits: int = 4) -> str:
+    """Return a number in words, rounded downwards; see `at_most`."""
+    return f"{-float(at_most(-value, digits)):.{digits}g}"
+
+
 def at_most(value: float, digits: int = 4) -> str:
     """Return a number in words, rounded upwards: what is claimed is never less than was proved."""
     if not math.isfinite(value):

@@ -211,6 +211,9 @@ def test_a_certificate_says_what_is_observed_calibrated_and_not_proved(
     # I <= W_bar <= chi I.
     spectrum = np.linalg.eigvalsh(np.array(found["metric"]["coefficients"])[0])
     assert spectrum[[0, -1]].tolist() == pytest.approx([1.0, found["chi"]], rel=1e-6)
+    texts = [line["text"] for line in found["statements"] if "<= W_bar <=" in line["text"]]
+    least, largest = (float(end.split()[-1]) for end in texts[0].split(" I")[:2])
+    assert least <= spectrum[0] <= spectrum[-1] <= largest
 
 
 def test_a_metric_that_does_not_contract_makes_no_certificate(measured: Slide, invoke: Any) -> None:

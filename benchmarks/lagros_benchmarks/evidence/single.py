@@ -31,7 +31,7 @@ from lagros_envs.task import Task
 from lagros_policies.contraction import BoxRegion, Samples, contraction_residual, load_metric
 from lagros_policies.contraction.certificate import Certificate, TubeSizes
 from lagros_policies.contraction.metric import extreme_eigenvalues
-from lagros_policies.contraction.statement import Statement, at_most
+from lagros_policies.contraction.statement import Statement, at_least, at_most
 from lagros_policies.contraction.theorems import contraction_distance, feasibility_residual
 from lagros_policies.proof.bounds import ProvedBounds
 from lagros_policies.proof.condition import prove
@@ -180,8 +180,8 @@ def _proofs(
         missing = f"no proof for {task.name} that W_bar is a metric on the box; {missing}"
     else:
         text = (
-            f"I <= W_bar <= {at_most(bounds.condition, 6)} I and ||B|| <= "
-            f"{at_most(bounds.control_gain, 6)} on the box, in the units of the scaling"
+            f"{at_least(bounds.least, 6)} I <= W_bar <= {at_most(bounds.largest, 6)} I and "
+            f"||B|| <= {at_most(bounds.control_gain, 6)} on the box, in the units of the scaling"
         )
         lines.append(Statement(text, "proved", True, time.monotonic() - begun - first.seconds))
     undecided = () if lines[:1] == [first] else (f"no proof for {task.name} of {first.text}",)
