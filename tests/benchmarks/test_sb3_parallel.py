@@ -187,7 +187,7 @@ def test_attributes_and_methods_reach_the_worlds():
     np.testing.assert_array_equal(states[2], env.worlds[1].state())
     env.set_attr("label", "x")
     assert env.get_attr("label") == ["x"] * 6
-    with pytest.raises(ValueError, match="all rows"):
+    with pytest.raises(ValueError, match="all of them"):
         env.set_attr("label", "y", [0])
     assert env.env_is_wrapped(Monitor) == [True] * 6
     assert env.env_is_wrapped(VecMonitor, 0) == [False]

@@ -19,7 +19,6 @@ pytest.importorskip("stable_baselines3")
 from stable_baselines3.common.vec_env import VecNormalize
 
 from lagros_benchmarks.run.settings import BenchmarkSettings
-from lagros_benchmarks.tasks.cartpole.training import CartPoleLesson
 from lagros_benchmarks.training import single
 from lagros_benchmarks.training.agent import make_agent
 from lagros_benchmarks.training.course import course_of, default_training, lesson_of
@@ -30,6 +29,7 @@ from lagros_benchmarks.training.settings import (
     FINAL,
     OffPolicy,
 )
+from lagros_benchmarks.training.single import SingleLesson
 from lagros_envs.registry import find_task, task_names
 from lagros_envs.seeding import EVALUATION, episode_seeds
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
@@ -111,7 +111,7 @@ def test_no_episode_of_training_or_its_figures_is_one_of_the_benchmark():
 
 def test_the_figures_are_of_episodes_that_neither_training_nor_the_benchmark_meets(monkeypatch):
     training = replace(TINY, curve_episodes=40, final_episodes=50)
-    lesson = CartPoleLesson(training)
+    lesson = SingleLesson(training)
     flown = []
 
     def spy(policy, seeds, *condition):
@@ -134,7 +134,7 @@ def test_the_worlds_in_training_are_those_of_the_settings(name, correction):
     algorithm = replace(ALGORITHMS[name], discount=0.97)
     task = {"effort_weight": 0.7, "disturbance": "sphere", "disturbance_bound": 0.3}
     training = replace(TINY, algorithm=algorithm, largest_correction=correction, **task)
-    venv = CartPoleLesson(training).venv
+    venv = SingleLesson(training).venv
     disturbance, settings = venv.get_attr("disturbance")[0], venv.get_attr("settings")[0]
     assert (disturbance.kind, disturbance.bound) == ("sphere", 0.3)
     assert settings == CartPoleSettings(effort_weight=0.7)
@@ -152,7 +152,7 @@ def test_the_agent_has_the_hyperparameters_of_the_settings():
     ):
         algorithm = replace(ALGORITHMS[name], **change)
         training = replace(TINY, algorithm=algorithm, seed=5)
-        model = made[name] = make_agent(training, CartPoleLesson(training).venv)
+        model = made[name] = make_agent(training, SingleLesson(training).venv)
         assert (model.gamma, model.seed) == (algorithm.discount, 5)
         assert model.batch_size == algorithm.batch_size
         assert [len(bias) for bias in single.actor_network(model).biases] == [8, 1]
@@ -172,7 +172,7 @@ def test_the_agent_has_the_hyperparameters_of_the_settings():
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_what_is_kept_of_a_correction_is_what_flew_in_training(name, tmp_path):
     training = replace(TINY, algorithm=ALGORITHMS[name], largest_correction=3.0)
-    lesson = CartPoleLesson(training)
+    lesson = SingleLesson(training)
     if isinstance(lesson.venv, VecNormalize):
         lesson.venv.training = False  # the running mean is fixed at the export
     model = make_agent(training, lesson.venv)
@@ -275,7 +275,7 @@ def test_a_run_without_its_weights_is_made_again(tmp_path, how):
 
 def test_the_folder_of_another_run_is_refused(tmp_path, monkeypatch):
     folder = tmp_path / "run"
-    monkeypatch.setattr(CartPoleLesson, "final", lambda *_: pytest.fail("too far"))
+    monkeypatch.setattr(SingleLesson, "final", lambda *_: pytest.fail("too far"))
     with pytest.raises(pytest.fail.Exception):
         run(TINY, folder)
     other = replace(TINY, seed=1)
@@ -325,14 +325,14 @@ def test_events_hold_the_curve_once_also_after_a_kill(tmp_path, monkeypatch):
 
     training = replace(TINY, algorithm=ALGORITHMS["td3"])
     saved = []
-    save = CartPoleLesson.figures
+    save = SingleLesson.figures
 
     def killed_once(lesson, model):
         figures = save(lesson, model)
         saved.append(figures)
         return figures
 
-    monkeypatch.setattr(CartPoleLesson, "figures", killed_once)
+    monkeypatch.setattr(SingleLesson, "figures", killed_once)
     from lagros_benchmarks.training import run as run_module
 
     write = run_module._save

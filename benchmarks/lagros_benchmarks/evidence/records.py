@@ -8,6 +8,9 @@ from lagros_envs.task import Described
 from lagros_policies.contraction.statement import Statement
 from lagros_policies.room import shipped_file
 
+# Policies that track with u* itself.
+_EXACT = ("tube-mpc", "centralized")
+
 
 def recorded_error(task: Described, policy: str) -> float:
     """Return the largest ||u_L - u*|| of the held-out samples, from the network's own record.
@@ -27,11 +30,13 @@ def recorded_error(task: Described, policy: str) -> float:
         raise ValueError(f"{path} holds no learning_error: {error}") from error
 
 
-def recorded_statement(task: Described, policy: str, unit: str) -> Statement:
-    """Return the recorded learning error as a line of a certificate, in a unit."""
-    error = " ".join(part for part in (f"{recorded_error(task, policy):.4g}", unit) if part)
+def recorded(task: Described, policy: str, unit: str) -> tuple[float, list[Statement]]:
+    """Return the recorded learning error and its line of a certificate; 0 and no line for u*."""
+    if policy in _EXACT:
+        return 0.0, []
+    error = recorded_error(task, policy)
     text = (
-        f"||u_L - u*|| <= {error} on the held-out samples of the training of {policy}, "
-        "for the u* that it imitates (its record); no bound for other states"
+        f"||u_L - u*|| <= {f'{error:.4g} {unit}'.strip()} on the held-out samples of the training "
+        f"of {policy}, for the u* that it imitates (its record); no bound for other states"
     )
-    return Statement(text, "observed", True, 0.0)
+    return error, [Statement(text, "observed", True, 0.0)]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.evidence.calibration import single_statements
-from lagros_benchmarks.evidence.records import recorded_error, recorded_statement
+from lagros_benchmarks.evidence.records import recorded
 from lagros_benchmarks.worst_case.flights import (
     draw_episodes,
     expert_of,
@@ -118,12 +118,10 @@ def certify(task: Task, question: Question) -> Certificate:
             f"{task.name} has no metric of its own, which a certificate is about and by which u* "
             "flies: give the task a MetricDesign, or --metric a file and --episodes 0"
         )
-    learned = question.policy != "tube-mpc"
     proved, bounds, missing = _proofs(task, metric, question.seconds)
     lines = [*proved, _condition(task, metric), _feasible(task, metric)]
-    error = recorded_error(task, question.policy) if learned else 0.0
-    if learned:
-        lines.append(recorded_statement(task, question.policy, task.control_unit))
+    error, record = recorded(task, question.policy, task.control_unit)
+    lines += record
     observed = None
     if question.episodes:
         flights = fly_kinds(task, question.policy, question.bound, question.episodes)

@@ -53,7 +53,7 @@ def terminal_table(group: Sequence[Row]) -> Table:
     shown = words.columns(group[0])
     headings = [f"{heading}\n{unit}".strip() for heading, unit, _ in shown]
     contents = [[content(row) for _, _, content in shown] for row in words.ordered(group)]
-    return _table(headings, contents, words.title(group[0]), words.framed(group[0]))
+    return plain_table(headings, contents, words.title(group[0]), words.framed(group[0]))
 
 
 def comparison_lines(group: Sequence[Row]) -> Iterator[str]:
@@ -68,15 +68,16 @@ def comparison_lines(group: Sequence[Row]) -> Iterator[str]:
 def sweep_tables(rows: Sequence[Row]) -> Iterator[tuple[str, Table]]:
     """Yield title and rich table of several conditions side by side, where there are several."""
     for title, headings, contents in texts(rows[0]).sweeps(rows):
-        yield title, _table(headings, contents)
+        yield title, plain_table(headings, contents)
 
 
-def _table(
+def plain_table(
     headings: Sequence[str],
     contents: Sequence[Sequence[str]],
     title: str | None = None,
     framed: bool = False,
 ) -> Table:
+    """Return a table as all are printed: its first column to the left, no cell wrapped."""
     from rich import box
     from rich.table import Table
     from rich.text import Text

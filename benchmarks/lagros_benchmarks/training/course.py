@@ -5,7 +5,6 @@ Nothing here needs torch; the lesson does, and is imported when it begins.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -26,12 +25,10 @@ class SingleCourse:
     """Learning to control one body.
 
     Attributes:
-        place: Module and class of the lesson.
         takes_parallel: Whether the rows may come from a parallel environment of PettingZoo.
         abscissa: What the curves are drawn over.
     """
 
-    place = "lagros_benchmarks.training.single:SingleLesson"
     takes_parallel = False
     abscissa = "control steps [millions]"
 
@@ -81,16 +78,12 @@ class SingleCourse:
 
     def lesson(self, training: Any, parallel_env: bool = False) -> Any:
         """Return the task's part of a run, a `run.Lesson`."""
-        return imported(self.place)(training)
+        from lagros_benchmarks.training.single import SingleLesson
+
+        return SingleLesson(training)
 
 
 COURSE = SingleCourse()
-
-
-def imported(place: str) -> Any:
-    """Import what module:attribute names."""
-    module, _, attribute = place.partition(":")
-    return getattr(importlib.import_module(module), attribute)
 
 
 def disturbance(row: dict[str, Any]) -> str:

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from lagros_benchmarks.training.sb3_vector import AlikeVecEnv, world_seeds
+from lagros_benchmarks.training.sb3_vector import AlikeVecEnv, Indices, world_seeds
 from lagros_envs.checks import shown
-
-Indices = int | Iterable[int] | None
 
 
 class ParallelVecEnv(AlikeVecEnv):
@@ -69,9 +66,6 @@ class ParallelVecEnv(AlikeVecEnv):
         super().__init__(len(self.worlds) * len(self.agents), *spaces)
         self._np_random, _ = seeding.np_random(None)
         self._first: list[int] | None = None
-        self._actions: NDArray[Any] | None = None
-        self._returns = np.zeros(self.num_envs)
-        self._lengths = np.zeros(self.num_envs, dtype=np.intp)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set the seed of the next reset, from which all later episodes draw theirs, too.
@@ -89,15 +83,9 @@ class ParallelVecEnv(AlikeVecEnv):
 
     def reset(self) -> NDArray[np.float32]:
         """Start an episode in every world and return the observations (rows, n)."""
-        self._returns[:] = 0.0
-        self._lengths[:] = 0
-        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._begin_episodes()
         first, self._first = self._first, None
         return np.stack(self._begin(range(len(self.worlds)), first))
-
-    def step_async(self, actions: NDArray[Any]) -> None:
-        """Store the actions (rows, m) of the coming step."""
-        self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
         """Take the step: observations, rewards, dones and one info per row.
@@ -106,9 +94,7 @@ class ParallelVecEnv(AlikeVecEnv):
             RuntimeError: `step_async` was not called before, or some agents of a world ended
                 without the others.
         """
-        if self._actions is None:
-            raise RuntimeError("call step_async() before step_wait()")
-        actions, self._actions = self._actions, None
+        actions = self._taken()
         rows: list[NDArray[np.float32]] = []
         rewards: list[float] = []
         dones: list[bool] = []
@@ -152,10 +138,7 @@ class ParallelVecEnv(AlikeVecEnv):
         Raises:
             ValueError: Only some rows were chosen.
         """
-        if len(list(self._get_indices(indices))) != self.num_envs:
-            raise ValueError(
-                f"the agents of a world share {attr_name!r}: it can be set for all rows only"
-            )
+        self._check_all(attr_name, indices)
         for world in self.worlds:
             setattr(world, attr_name, value)
 
@@ -169,14 +152,6 @@ class ParallelVecEnv(AlikeVecEnv):
             for world in {id(world): world for world in chosen}.values()
         }
         return [values[id(world)] for world in chosen]
-
-    def env_is_wrapped(
-        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Indices = None
-    ) -> list[bool]:
-        """Return False per chosen row, or True for Monitor, whose `episode` entry is provided."""
-        from stable_baselines3.common.monitor import Monitor
-
-        return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
     def _rows(self, world: int) -> slice:
         return slice(world * len(self.agents), (world + 1) * len(self.agents))
@@ -205,20 +180,6 @@ class ParallelVecEnv(AlikeVecEnv):
                 "together"
             )
         return not world.agents
-
-    def _close_episodes(
-        self, rewards: NDArray[np.float64], dones: NDArray[np.bool_], infos: list[dict[str, Any]]
-    ) -> None:
-        """Add up returns, and note those of the episodes that are over."""
-        self._returns += rewards
-        self._lengths += 1
-        for row in np.flatnonzero(dones):
-            infos[row]["episode"] = {
-                "r": float(self._returns[row]),
-                "l": int(self._lengths[row]),
-            }
-        self._returns[dones] = 0.0
-        self._lengths[dones] = 0
 
 
 def _final(

@@ -31,7 +31,57 @@ def world_seeds(seed: int | None, worlds: int) -> list[int]:
 
 
 class AlikeVecEnv(VecEnv):
-    """What our `VecEnv`s share: their worlds are started alike."""
+    """What our `VecEnv`s share: worlds that start alike, and the entries of episodes that ended."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._actions: NDArray[Any] | None = None
+        self._returns = np.zeros(self.num_envs)
+        self._lengths = np.zeros(self.num_envs, dtype=np.intp)
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Store the actions (rows, m) of the coming step."""
+        self._actions = actions
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Indices = None
+    ) -> list[bool]:
+        """Return False per chosen row, or True for Monitor, whose `episode` entry is provided."""
+        from stable_baselines3.common.monitor import Monitor
+
+        return [wrapper_class is Monitor for _ in self._get_indices(indices)]
+
+    def _begin_episodes(self) -> None:
+        self._returns[:] = 0.0
+        self._lengths[:] = 0
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+
+    def _taken(self) -> NDArray[Any]:
+        """Return the actions of this step."""
+        if self._actions is None:
+            raise RuntimeError("call step_async() before step_wait()")
+        actions, self._actions = self._actions, None
+        return actions
+
+    def _close_episodes(
+        self, rewards: NDArray[Any], done: NDArray[np.bool_], infos: list[dict[str, Any]]
+    ) -> None:
+        """Add up returns, and note those of the episodes that are over."""
+        self._returns += rewards
+        self._lengths += 1
+        for row in np.flatnonzero(done):
+            infos[row]["episode"] = {"r": float(self._returns[row]), "l": int(self._lengths[row])}
+        self._returns[done] = 0.0
+        self._lengths[done] = 0
+
+    def _check_all(self, name: str, indices: Indices) -> None:
+        """Refuse to set an attribute for some rows, as those of a world share it.
+
+        Raises:
+            ValueError: Only some were chosen.
+        """
+        if len(list(self._get_indices(indices))) != self.num_envs:
+            raise ValueError(f"the rows share {name!r}: it can be set for all of them only")
 
     def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
         """Refuse options for the next reset, which the worlds would not get.
@@ -79,9 +129,6 @@ class SB3VectorEnv(AlikeVecEnv):
         self.venv = venv
         super().__init__(venv.num_envs, venv.single_observation_space, venv.single_action_space)
         self._seed: int | None = None
-        self._actions: NDArray[Any] | None = None
-        self._returns = np.zeros(self.num_envs)
-        self._lengths = np.zeros(self.num_envs, dtype=np.intp)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set the seed of the next reset.
@@ -102,14 +149,8 @@ class SB3VectorEnv(AlikeVecEnv):
         """Start an episode in every world and return the observations (worlds, n)."""
         observation, _ = self.venv.reset(seed=self._seed)
         self._seed = None
-        self._returns[:] = 0.0
-        self._lengths[:] = 0
-        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._begin_episodes()
         return np.asarray(observation)
-
-    def step_async(self, actions: NDArray[Any]) -> None:
-        """Store the actions (worlds, m) of the coming step."""
-        self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
         """Take the step: observations, rewards, dones and one info per world.
@@ -117,12 +158,7 @@ class SB3VectorEnv(AlikeVecEnv):
         Raises:
             RuntimeError: `step_async` was not called before.
         """
-        if self._actions is None:
-            raise RuntimeError("call step_async() before step_wait()")
-        observation, reward, terminated, truncated, info = self.venv.step(self._actions)
-        self._actions = None
-        self._returns += reward
-        self._lengths += 1
+        observation, reward, terminated, truncated, info = self.venv.step(self._taken())
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for world in np.flatnonzero(done):
@@ -131,12 +167,7 @@ class SB3VectorEnv(AlikeVecEnv):
             infos[world]["terminal_observation"] = info["final_obs"][world]
             # A fall at the very last step is a fall: nothing is bootstrapped.
             infos[world]["TimeLimit.truncated"] = bool(truncated[world] and not terminated[world])
-            infos[world]["episode"] = {
-                "r": float(self._returns[world]),
-                "l": int(self._lengths[world]),
-            }
-        self._returns[done] = 0.0
-        self._lengths[done] = 0
+        self._close_episodes(reward, done, infos)
         return observation, np.asarray(reward, dtype=np.float32), done, infos
 
     def close(self) -> None:
@@ -154,8 +185,7 @@ class SB3VectorEnv(AlikeVecEnv):
         Raises:
             ValueError: Only some worlds were chosen.
         """
-        if len(list(self._get_indices(indices))) != self.num_envs:
-            raise ValueError(f"the worlds share {attr_name!r}: it can be set for all of them only")
+        self._check_all(attr_name, indices)
         setattr(self.venv, attr_name, value)
 
     def env_method(
@@ -164,14 +194,6 @@ class SB3VectorEnv(AlikeVecEnv):
         """Call a method of the environment once and return its value per chosen world."""
         value = getattr(self.venv, method_name)(*method_args, **method_kwargs)
         return [value for _ in self._get_indices(indices)]
-
-    def env_is_wrapped(
-        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Indices = None
-    ) -> list[bool]:
-        """Return False per chosen world, or True for Monitor, whose `episode` entry is provided."""
-        from stable_baselines3.common.monitor import Monitor
-
-        return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
 
 class LinearFeatures(VecEnvWrapper):

@@ -23,7 +23,7 @@ from lagros_envs.checks import (
 from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.registry import find_task, first_task
 from lagros_envs.seeding import EVALUATION
-from lagros_envs.task import Task
+from lagros_envs.task import Numbers, Task
 
 # Segments are namespaces of their own in `lagros_envs.seeding`'s sense, far below `EVALUATION`.
 MOST_SEGMENTS = 1 << 16
@@ -258,11 +258,14 @@ class SingleTraining(Training):
         largest_correction: The agent corrects LAG-ROS by at most so much, in the units of the
             control; None for an agent that controls the body alone.
         task: The task.
+        feature_scales: What is large on the task, for the features of an agent that learns from a
+            buffer; () for the task's `state_scale`.
 
     Raises:
         ValueError: A value is out of range.
     """
 
+    feature_scales: ClassVar[Numbers] = ()
     largest_correction: float | None = None
     task: str = field(default_factory=first_task)
 

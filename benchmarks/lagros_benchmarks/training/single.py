@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -86,11 +86,7 @@ class SingleLesson:
 
     Attributes:
         venv: The worlds as the agent meets them.
-        feature_scales: What is large on the task, for the features of an agent without running
-            normalisation; () for the task's `state_scale`.
     """
-
-    feature_scales: ClassVar[Numbers] = ()
 
     def __init__(self, training: SingleTraining) -> None:
         """Build the worlds; see the class."""
@@ -118,7 +114,7 @@ class SingleLesson:
         if isinstance(training.algorithm, OffPolicy):
             # A buffer of old features must not change its meaning: their scale is fixed.
             scales = np.ones(len(frame))
-            known = self.feature_scales or self.settings.state_scale
+            known = training.feature_scales or self.settings.state_scale
             scales[: len(known)] = known
             self.venv: VecEnv = LinearFeatures(venv, frame / scales[:, None])
         else:

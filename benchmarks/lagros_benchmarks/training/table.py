@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from lagros_benchmarks.report.tables import plain_table
 from lagros_benchmarks.training.course import course_of
 from lagros_envs.registry import find_task
 
@@ -19,16 +19,8 @@ def final_table(record: dict[str, Any]) -> Table:
         record: As `run.train` returns it. Its efforts are those to the first success, else to the
             end of the episode, as in the tables of `lagros bench`; the record has more figures.
     """
-    from rich import box
-    from rich.table import Table
-
     task = find_task(record["training"]["task"])
     columns = course_of(task).columns(task)
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, collapse_padding=True)
-    for index, (heading, unit, _) in enumerate(columns):
-        justify: Any = "right" if index else "left"
-        table.add_column(f"{heading}\n{unit}".strip(), justify=justify, no_wrap=True)
-    rows: Sequence[dict[str, Any]] = record["final"]
-    for row in rows:
-        table.add_row(*(content(row) for _, _, content in columns))
-    return table
+    headings = [f"{heading}\n{unit}".strip() for heading, unit, _ in columns]
+    rows = [[content(row) for _, _, content in columns] for row in record["final"]]
+    return plain_table(headings, rows)

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 import lagros_policies
-from lagros_benchmarks.evidence.records import recorded_error, recorded_statement
+from lagros_benchmarks.evidence.records import recorded
 from lagros_benchmarks.evidence.single import (
     Question,
     SingleFlights,
@@ -77,9 +77,7 @@ def certify(task: CartPoleSettings, question: Question) -> Certificate:
         else cartpole_proofs(metric, question.seconds, large)
     )
     policy, bound = question.policy, question.bound
-    learned = policy == "lagros"
-    error = recorded_error(task, policy) if learned else 0.0
-    lines = [recorded_statement(task, policy, "N")] if learned else []
+    error, lines = recorded(task, policy, task.control_unit)
     flights = fly_kinds(task, policy, bound, question.episodes) if question.episodes else None
     met: float | None = None
     if flights is not None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from lagros_benchmarks.training.course import SingleCourse
 from lagros_benchmarks.training.settings import Ppo, Sac, SingleTraining, Td3, Training
-from lagros_envs.task import Task
+from lagros_envs.task import Numbers, Task
 
 
 @dataclass(frozen=True)
@@ -19,14 +19,14 @@ class CartPoleTraining(SingleTraining):
         effort_weight: At the task's 0.01 an agent balances at twice the effort.
     """
 
+    # The farthest goal [m], a start [rad], and the rates of a cart that hurries there [m/s, rad/s].
+    feature_scales: ClassVar[Numbers] = (5.0, 1.0, 5.0, 3.0)
     effort_weight: float = 0.1
     task: str = "cartpole"
 
 
 class CartPoleCourse(SingleCourse):
     """See `SingleCourse`."""
-
-    place = "lagros_benchmarks.tasks.cartpole.training:CartPoleLesson"
 
     def trainings(self, task: Task) -> Mapping[str, Training]:
         """Return the settings of every algorithm, by its name."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lagros_benchmarks.evidence.records import recorded_error, recorded_statement
+from lagros_benchmarks.evidence.records import recorded
 from lagros_benchmarks.evidence.single import KINDS, LEAST, LEVEL, Question, UnservedError
 from lagros_benchmarks.tasks.spacecraft.calibration import (
     POSITION_ERROR,
@@ -44,19 +44,17 @@ def certify(task: SpacecraftSettings, question: Question) -> Certificate:
     if question.largest:
         raise UnservedError(f"--largest: the proof of {task.name} is for all states already")
     period, policy, bound = task.control_period, question.policy, question.bound
-    learned = policy == "lagros"
+    error, lines = recorded(task, policy, "m/s^2")
     found = spacecraft_certificate(
         load_axis_metric(question.metric, _PLANE_RATE, period),
         load_axis_metric(None, _TURNING_RATE, period),
         task.system,
         disturbance_bound=bound,
-        learning_error=recorded_error(task, policy) if learned else 0.0,
+        learning_error=error,
         paper_radius=task.tube.steady_radius,
         thrust=task.thrust_scale,
         policy=policy,
-    )
-    if learned:
-        found = found.with_evidence([recorded_statement(task, policy, "m/s^2")])
+    ).with_evidence(lines)
     count = question.episodes
     if count == 0 or question.metric is not None:
         return found

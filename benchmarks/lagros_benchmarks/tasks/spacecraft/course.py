@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from lagros_benchmarks.report.formats import number, percent
-from lagros_benchmarks.training.course import Column, Panel, disturbance, imported, success
+from lagros_benchmarks.training.course import Column, Panel, disturbance, success
 from lagros_benchmarks.training.settings import Algorithm, Ppo, Training
 from lagros_envs.checks import (
     check_disturbance_bound,
@@ -145,8 +145,9 @@ class SpacecraftCourse:
 
     def lesson(self, training: SpacecraftTraining, parallel_env: bool = False) -> Any:
         """Return the part of a run, a `run.Lesson`."""
-        place = "lagros_benchmarks.tasks.spacecraft.training:SpacecraftLesson"
-        return imported(place)(training, parallel_env)
+        from lagros_benchmarks.tasks.spacecraft.training import SpacecraftLesson
+
+        return SpacecraftLesson(training, parallel_env)
 
 
 COURSE = SpacecraftCourse()
