@@ -15,7 +15,9 @@ import typer
 from lagros_benchmarks.commands.extras import check_extra
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs, policy_files
 from lagros_benchmarks.commands.terminal import (
+    BOUND,
     fail,
+    file_option,
     find_users_modules,
     options_given,
     refuse_options,
@@ -37,14 +39,7 @@ def attack(
             help="What to break: tube (||x - x_d||), success, or clearance (a fall, a collision)."
         ),
     ] = "success",
-    bound: Annotated[
-        float | None,
-        typer.Option(
-            metavar="D",
-            help="Bound d̄ of the disturbance, in units of the state per second; the task's own "
-            "if not given.",
-        ),
-    ] = None,
+    bound: Annotated[float | None, BOUND] = None,
     episodes: Annotated[
         int | None,
         typer.Option(help="Episodes, each with its own worst case; the task's own if not given."),
@@ -61,21 +56,11 @@ def attack(
     safety_filter: Annotated[
         bool, typer.Option("--safety-filter", help="Put the safety filter on the policy.")
     ] = False,
-    json: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", dir_okay=False, help="All figures, as JSON."),
-    ] = None,
-    npz: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", dir_okay=False, help="The sequences found, to replay."),
-    ] = None,
+    json: Annotated[Path | None, file_option("All figures, as JSON.")] = None,
+    npz: Annotated[Path | None, file_option("The sequences found, to replay.")] = None,
     replay: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            dir_okay=False,
-            help="Fly the sequences of such a file again, and fail where a figure differs.",
-        ),
+        file_option("Fly the sequences of such a file again, and fail where a figure differs."),
     ] = None,
 ) -> None:
     """Search the worst bounded disturbance, fly it, and hold the certificate against it.
@@ -83,6 +68,7 @@ def attack(
     Exit status 3: everything is written, and the policy raised in some episodes, which are broken.
     """
     from lagros_benchmarks.run.library import SetupError
+    from lagros_benchmarks.worst_case.attack import AttackSettings
 
     find_users_modules([policy])
     try:
@@ -93,50 +79,25 @@ def attack(
             )
             _replay(task, policy, replay)
             return
-        settings = _settings(task, policy, goal, bound, episodes, budget, seed, method)
-        if safety_filter:
-            from dataclasses import replace
-
-            settings = replace(settings, safety_filter=True)
+        if method == "cma":
+            check_extra("--method cma", "attack")
+        settings = AttackSettings.for_task(
+            task,
+            method,
+            budget,
+            policy=policy,
+            goal=goal,
+            bound=bound,
+            episodes=episodes,
+            seed=seed,
+            safety_filter=safety_filter,
+        )
         check_outputs({"--json": json, "--npz": npz}, policy_files([policy]))
         _search(settings, json, npz)
     except (ValueError, OSError) as error:
         fail(error)
     except (ImportError, SetupError) as error:
         fail(error, status=1)
-
-
-def _settings(
-    task: str,
-    policy: str,
-    goal: str,
-    bound: float | None,
-    episodes: int | None,
-    budget: int | None,
-    seed: int,
-    method: str,
-) -> AttackSettings:
-    from lagros_benchmarks.worst_case.attack import AttackSettings, bench_of
-    from lagros_benchmarks.worst_case.search import SearchSettings
-    from lagros_envs.registry import find_task
-
-    if method == "cma":
-        check_extra("--method cma", "attack")
-    described = find_task(task)
-    defaults = described.defaults
-    return AttackSettings(
-        task=described.name,
-        policy=policy,
-        goal=goal,
-        bound=defaults.bound if bound is None else bound,
-        episodes=defaults.attack_episodes if episodes is None else episodes,
-        seed=seed,
-        search=SearchSettings(
-            method,
-            budget=defaults.attack_budget if budget is None else budget,
-            population=bench_of(described.name).population,
-        ),
-    )
 
 
 def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> None:

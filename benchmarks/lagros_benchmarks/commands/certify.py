@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 import typer
 
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs
-from lagros_benchmarks.commands.terminal import fail
+from lagros_benchmarks.commands.terminal import fail, file_option
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -26,19 +26,14 @@ _CHANNELS = {"all": "all states disturbed", "rates": "the rates disturbed, not t
 
 def certify(
     task: Annotated[str, typer.Argument(help="As for `lagros bench`.")],
-    metric: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", dir_okay=False, help="A metric of your own; ours if not."),
-    ] = None,
+    metric: Annotated[Path | None, file_option("A metric of your own; ours if not.")] = None,
     policy: Annotated[
         str | None,
         typer.Option(
             metavar="NAME", help="lagros, or u* itself: tube-mpc of one body, centralized of many."
         ),
     ] = None,
-    json: Annotated[
-        Path | None, typer.Option(metavar="FILE", dir_okay=False, help="Write the certificate.")
-    ] = None,
+    json: Annotated[Path | None, file_option("Write the certificate.")] = None,
     bound: Annotated[float | None, typer.Option(help="d̄; the task's own if not given.")] = None,
     episodes: Annotated[
         int | None,

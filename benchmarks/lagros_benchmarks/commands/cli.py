@@ -24,6 +24,7 @@ from lagros_benchmarks.commands.terminal import (
     Command,
     Commands,
     fail,
+    file_option,
     find_users_modules,
     interrupted,
     listed,
@@ -56,12 +57,6 @@ app = typer.Typer(
 
 
 TASK = typer.Argument(help="{tasks}; or one of your own: module:attribute, or a .py file.")
-
-
-def _file(explanation: str) -> Any:
-    return typer.Option(metavar="FILE", dir_okay=False, help=explanation)
-
-
 BACKEND_OPTION = typer.Option(
     help="Where the workers run: loky (this machine), or a cluster of ray or dask."
 )
@@ -134,23 +129,25 @@ def bench(
     replan_every: Annotated[
         int | None, typer.Option(help="One body: control steps between the plans of tube-mpc, 1.")
     ] = None,
-    json: Annotated[Path | None, _file("All figures, one object per policy and condition.")] = None,
-    csv: Annotated[Path | None, _file("The scalar figures.")] = None,
-    latex: Annotated[Path | None, _file("The table, for LaTeX with booktabs.")] = None,
-    markdown: Annotated[Path | None, _file("The table, as Markdown.")] = None,
+    json: Annotated[
+        Path | None, file_option("All figures, one object per policy and condition.")
+    ] = None,
+    csv: Annotated[Path | None, file_option("The scalar figures.")] = None,
+    latex: Annotated[Path | None, file_option("The table, for LaTeX with booktabs.")] = None,
+    markdown: Annotated[Path | None, file_option("The table, as Markdown.")] = None,
     figure: Annotated[
         Path | None,
-        _file(
+        file_option(
             "One body: error over time, or success against the bound. Agents: success and effort "
             "against the bound; against their number success and time."
         ),
     ] = None,
     scene: Annotated[
-        Path | None, _file("Agents: trajectories of every policy in one world.")
+        Path | None, file_option("Agents: trajectories of every policy in one world.")
     ] = None,
     scene_world: Annotated[int, typer.Option(help="Which of the run's worlds, from 0.")] = 0,
     episodes_file: Annotated[
-        Path | None, _file("Every episode (every agent), as JSON Lines.")
+        Path | None, file_option("Every episode (every agent), as JSON Lines.")
     ] = None,
     out: Annotated[
         Path | None,

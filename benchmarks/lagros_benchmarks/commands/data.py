@@ -20,7 +20,7 @@ import typer
 
 from lagros_benchmarks.commands.extras import check_extra
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs
-from lagros_benchmarks.commands.terminal import Command, fail, progress_bar, refuse_options
+from lagros_benchmarks.commands.terminal import BOUND, Command, fail, progress_bar, refuse_options
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -50,13 +50,7 @@ def export(
     disturbance: Annotated[
         str, typer.Option(help="Of none, uniform, sphere, constant, sinusoid, gust.")
     ] = "uniform",
-    bound: Annotated[
-        float | None,
-        typer.Option(
-            help="Bound d̄ of the disturbance, in units of the state per second; the task's own "
-            "if not given."
-        ),
-    ] = None,
+    bound: Annotated[float | None, BOUND] = None,
     out: Annotated[
         Path,
         typer.Option(file_okay=False, help=f"Folder of datasets; Minari's {DATASETS_PATH}."),
@@ -77,9 +71,6 @@ def export(
             refuse_options(["--bound"], "no disturbance has a bound")
         described = find_task(task or first_task())
         settings = DemonstrationSettings(described.name, episodes, seed, disturbance, bound)
-    except ValueError as error:
-        fail(error)
-    try:
         identifier = dataset_id(described.name)
         check_free(out, identifier)
     except ValueError as error:

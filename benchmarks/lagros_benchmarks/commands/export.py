@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs
-from lagros_benchmarks.commands.terminal import fail
+from lagros_benchmarks.commands.terminal import fail, file_option
 
 if TYPE_CHECKING:
     from lagros_policies.export.c99 import Tanh
@@ -37,15 +37,9 @@ def export(
         str,
         typer.Option("--format", metavar="FORMAT", help="c (one C99 file) or onnx."),
     ] = "c",
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", dir_okay=False, help="Where to; POLICY_TASK.c or .onnx."),
-    ] = None,
+    out: Annotated[Path | None, file_option("Where to; POLICY_TASK.c or .onnx.")] = None,
     weights: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", dir_okay=False, help="Weights of your own; those of the task if not."
-        ),
+        Path | None, file_option("Weights of your own; those of the task if not.")
     ] = None,
     tanh: Annotated[
         str | None,

@@ -29,6 +29,12 @@ USAGE_ERROR = 2
 INTERRUPTED = 130
 
 Value = TypeVar("Value")
+# An option that several commands have.
+BOUND = typer.Option(
+    metavar="D",
+    help="Bound d̄ of the disturbance, in units of the state per second; the task's own if not "
+    "given.",
+)
 # The command that runs.
 _CONTEXT: ContextVar[Any] = ContextVar("context", default=None)
 # How the settings begin a message on one of their fields.
@@ -38,6 +44,11 @@ _FIELD = re.compile(
 )
 _SHOWN = 60  # letters of an entry in a message
 _LONGEST = 800  # letters of a message
+
+
+def file_option(explanation: str) -> Any:
+    """Return the option of a file that is read or written."""
+    return typer.Option(metavar="FILE", dir_okay=False, help=explanation)
 
 
 def fail(error: Exception | str, status: int = USAGE_ERROR) -> NoReturn:

@@ -16,7 +16,7 @@ import typer
 
 from lagros_benchmarks.commands.extras import check_extra
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs
-from lagros_benchmarks.commands.terminal import fail, interrupted, listed
+from lagros_benchmarks.commands.terminal import fail, file_option, interrupted, listed
 
 if TYPE_CHECKING:
     from lagros_benchmarks.training.settings import Training
@@ -61,14 +61,8 @@ def train(
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Write events for TensorBoard beside each run.")
     ] = False,
-    json: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", dir_okay=False, help="The learning curves of all runs."),
-    ] = None,
-    figure: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", dir_okay=False, help="The same, drawn."),
-    ] = None,
+    json: Annotated[Path | None, file_option("The learning curves of all runs.")] = None,
+    figure: Annotated[Path | None, file_option("The same, drawn.")] = None,
 ) -> None:
     """Train agents, one after the other; go on where a run was killed, skip what is complete."""
     from lagros_benchmarks.training.course import course_of, default_training
@@ -106,7 +100,7 @@ def train(
         )
     except ValueError as error:
         fail(str(error).replace("largest_correction", "--residual"))
-    _say_what_happens()
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(message)s")
     try:
         records = [
             _train_one(run, out, segments, residual, tensorboard, parallel_env) for run in runs
@@ -122,10 +116,6 @@ def train(
 def folder_of(run: Training, out: Path) -> Path:
     """Return the folder of a run."""
     return out / f"{run.task}-{run.label}" / f"seed-{run.seed}"
-
-
-def _say_what_happens() -> None:
-    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(message)s")
 
 
 def _train_one(

@@ -11,7 +11,13 @@ from typing import Annotated
 import typer
 
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs, policy_files
-from lagros_benchmarks.commands.terminal import fail, find_users_modules, refuse_options
+from lagros_benchmarks.commands.terminal import (
+    BOUND,
+    fail,
+    file_option,
+    find_users_modules,
+    refuse_options,
+)
 
 
 def watch(
@@ -34,30 +40,16 @@ def watch(
         str,
         typer.Option(help="Of none, uniform, sphere, constant, sinusoid, gust."),
     ] = "uniform",
-    bound: Annotated[
-        float | None,
-        typer.Option(
-            help="Bound d̄ of the disturbance, in units of the state per second; the task's own "
-            "if not given."
-        ),
-    ] = None,
+    bound: Annotated[float | None, BOUND] = None,
     seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
     scenario: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", dir_okay=False, help="A scenario as JSON, in place of the drawn one."
-        ),
+        Path | None, file_option("A scenario as JSON, in place of the drawn one.")
     ] = None,
     safety_filter: Annotated[
         bool, typer.Option("--safety-filter", help="Put the safety filter on the policy.")
     ] = False,
     video: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            dir_okay=False,
-            help="Write a .gif or .mp4 instead of opening a window.",
-        ),
+        Path | None, file_option("Write a .gif or .mp4 instead of opening a window.")
     ] = None,
     speed: Annotated[
         float | None,

@@ -83,6 +83,20 @@ class AttackSettings:
         if self.policy == "random":
             raise ValueError("policy='random' has no worst case: it draws its actions")
 
+    @classmethod
+    def for_task(cls, task: str, method: str, budget: int | None, **given: Any) -> AttackSettings:
+        """Return the settings of a task, with its own defaults for what is None."""
+        described = find_task(task)
+        usual = described.defaults
+        search = SearchSettings(
+            method,
+            budget=usual.attack_budget if budget is None else budget,
+            population=bench_of(described.name).population,
+        )
+        chosen = {name: value for name, value in given.items() if value is not None}
+        defaults = {"bound": usual.bound, "episodes": usual.attack_episodes}
+        return cls(task=described.name, search=search, **(defaults | chosen))
+
     def episode_seeds(self) -> list[int]:
         """Return the seeds of the episodes."""
         return episode_seeds(self.seed, self.episodes, ATTACK)
