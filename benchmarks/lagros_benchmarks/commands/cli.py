@@ -303,16 +303,9 @@ app.add_typer(data, name="data")
 def run_and_report(
     settings: BenchmarkSettings, outputs: Outputs, folder: Path, keep: bool = False
 ) -> list[Row]:
-    """Run a benchmark with a progress bar, write its files and print its table.
+    """Run a benchmark with a progress bar, write its files, print its table and return its rows.
 
-    Args:
-        settings: What to run.
-        outputs: What to write.
-        folder: Keeps finished work until the run is complete and its results are safe.
-        keep: Whether the work stays there even then.
-
-    Returns:
-        The rows.
+    The folder keeps finished work until the run is complete and its results are safe, or longer.
 
     Raises:
         typer.Exit: With status 1 if the run cannot begin or a file was not written, with 3 if

@@ -140,16 +140,7 @@ def write_minari(
     flown: Sequence[Demonstration],
     record: dict[str, Any],
 ) -> Written:
-    """Write demonstrations as a Minari dataset, whole or not at all.
-
-    Args:
-        folder: Folder of datasets.
-        settings: What was flown.
-        flown: The episodes.
-        record: What they depend on, see `demonstrations.demonstrate`.
-
-    Returns:
-        What was written.
+    """Write demonstrations as a Minari dataset in a folder of these, whole or not at all.
 
     Raises:
         ValueError: The folder already holds such a dataset.

@@ -26,15 +26,10 @@ MODULES = {
 
 
 def check_extra(what: str, extra: str, *modules: str) -> None:
-    """Check, before any work is done, that what it will need in the end is installed.
-
-    Args:
-        what: Who needs it, as the message names it.
-        extra: A key of `MODULES`.
-        modules: Those of its packages that are needed; all if none is named.
+    """Check, before any work, that the modules of an extra are installed, or those that are named.
 
     Raises:
-        ImportError: One is missing.
+        ImportError: One is missing; the message says `what` needs it.
     """
     missing = [module for module in modules or MODULES[extra] if find_spec(module) is None]
     if missing:
@@ -44,11 +39,7 @@ def check_extra(what: str, extra: str, *modules: str) -> None:
 def install_hint(error: BaseException) -> str:
     """Return how to install what an exception, or one that caused it, did not find; "" if unknown.
 
-    Args:
-        error: Any exception.
-
-    Returns:
-        A clause that begins with a semicolon, for the end of a message.
+    It is a clause that begins with a semicolon, for the end of a message.
     """
     cause: BaseException | None = error
     while cause is not None:

@@ -162,10 +162,7 @@ class Delivery:
         self.write(path, lambda place: write_atomic(place, text()), text)
 
     def tell(self, note: str = "") -> None:
-        """Say what was written and what was not.
-
-        Args:
-            note: What is worth knowing about the files that were written.
+        """Say what was written, with a note on it, and what was not.
 
         Raises:
             typer.Exit: With status 1, if a file was not written where it was asked for.

@@ -131,11 +131,7 @@ class Command(TyperCommand):
 
 
 def options_given(but: Collection[str] = ()) -> list[str]:
-    """Return the options that stand on the command line, such as "--bound".
-
-    Args:
-        but: Options that are not asked for.
-    """
+    """Return the options that stand on the command line, such as "--bound", but for some."""
     context = _CONTEXT.get()
     if context is None:
         return []
@@ -147,11 +143,7 @@ def options_given(but: Collection[str] = ()) -> list[str]:
 
 
 def refuse_options(given: Collection[str], why: str) -> None:
-    """Refuse options that would do nothing, of those that stand on the command line.
-
-    Args:
-        given: The options.
-        why: What makes them idle, for the message.
+    """Refuse options that would do nothing, and say why, of those that stand on the command line.
 
     Raises:
         ValueError: One stands there.
@@ -252,15 +244,10 @@ def find_users_modules(policies: Iterable[str]) -> None:
 def listed(
     text: str | Sequence[str], convert: Callable[[str], Value], option: str
 ) -> tuple[Value, ...]:
-    """Split a comma-separated option.
-
-    Args:
-        text: The option; or its entries, where it is not split at every comma.
-        convert: Makes a value of an entry.
-        option: Its name.
+    """Split a comma-separated option, or take its entries as they are, and convert each.
 
     Raises:
-        ValueError: An entry is empty, or cannot be converted.
+        ValueError: An entry is empty, or cannot be converted; the message names the option.
     """
     values = []
     entries = [part.strip() for part in text.split(",")] if isinstance(text, str) else text

@@ -82,15 +82,8 @@ def pretrained_hash(task: str, *settings: object, folder: Path | None = None) ->
     """Return a short hash of the weights and metrics of a task, for the names of kept flights.
 
     Whoever trains a network or designs a metric anew gets flights of the new one: nothing that was
-    flown with the old one is found under the new name.
-
-    Args:
-        task: Name of the task; all networks of it count, whichever of them fly.
-        settings: What else the flights depend on, each with a `repr` that says all of it.
-        folder: Where the files lie; that of the shipped ones if None.
-
-    Returns:
-        Twelve hexadecimal digits.
+    flown with the old one is found under the new name. All networks of the task count, shipped or
+    in a folder, and the settings, each with a `repr` that says all of it.
     """
     folder = folder or Path(lagros_policies.__file__).parent / "pretrained"
     networks = folder.glob(f"{task}_*.safetensors")
@@ -118,19 +111,16 @@ def single_scores(
     kind: str = "uniform",
     bound: float | None = None,
 ) -> EpisodeScores:
-    """Fly episodes of one body and return their scores.
+    """Fly episodes of one body and return their `scores_of`.
 
     Args:
         task: The task.
         policy: A policy that keeps no memory, or "tube-mpc".
-        count: n, episodes.
+        count: Episodes.
         namespace: Of the seeds.
         seed: Seed of the run.
         kind: Kind of the disturbance.
         bound: d_bar, in units of the state per second; None for that of the task's commands.
-
-    Returns:
-        `scores_of` every episode.
     """
     begun = perf_counter()
     expert = expert_of(task)
@@ -193,13 +183,7 @@ def single_statements(
 ) -> list[Statement]:
     """Return the calibrated lines of a certificate of one body: learning error and tube.
 
-    Args:
-        task: The task.
-        level: Probability of each bound.
-        episodes: Calibration episodes.
-        policy: As for `single_scores`.
-        kind: Kind of the disturbance.
-        bound: d_bar, in units of the state per second; None for that of the task's commands.
+    Each bound has the probability `level`; for the others see `single_scores`.
 
     Raises:
         ValueError: There are too few episodes for the level.
@@ -213,13 +197,7 @@ def single_statements(
 def calibrated(
     kinds: Sequence[Score], scores: EpisodeScores, level: float, where: str
 ) -> list[Statement]:
-    """Return a calibrated line for each score.
-
-    Args:
-        kinds: The scores.
-        scores: Their values.
-        level: Probability of each bound.
-        where: What was flown, in words.
+    """Return a calibrated line, of probability `level`, for each score of what was flown.
 
     Raises:
         ValueError: There are too few episodes for the level.

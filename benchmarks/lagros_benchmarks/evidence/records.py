@@ -15,10 +15,6 @@ _EXACT = ("tube-mpc", "centralized")
 def recorded_error(task: Described, policy: str) -> float:
     """Return the largest ||u_L - u*|| of the held-out samples, from the network's own record.
 
-    Args:
-        task: The task.
-        policy: Name of the network.
-
     Raises:
         FileNotFoundError: The network has no record.
         ValueError: The record holds no such figure.

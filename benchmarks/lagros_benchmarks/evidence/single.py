@@ -212,14 +212,7 @@ def _feasible(task: Task, metric: Any) -> Statement:
 
 
 def fly_kinds(task: Task, policy: str, bound: float, count: int) -> SingleFlights:
-    """Fly episodes of one body under several kinds of disturbance.
-
-    Args:
-        task: The task.
-        policy: A policy that keeps no memory, or "tube-mpc".
-        bound: d_bar, in units of the state per second.
-        count: Episodes of each kind.
-    """
+    """Fly so many episodes of one body under each of `KINDS`; see `single_scores`."""
     begun = time.monotonic()
     expert = expert_of(task)
     episodes = draw_episodes(expert, episode_seeds(1, count, CALIBRATION))
@@ -242,13 +235,9 @@ def fly_kinds(task: Task, policy: str, bound: float, count: int) -> SingleFlight
 def met_error(
     task: Task, flights: SingleFlights, metric: Any, inside: BoolArray | None = None
 ) -> tuple[float, Statement]:
-    """Return how far the controls of flights were from contracting ones, in the region.
+    """Return how far the controls of flights were from ones that contract in a metric.
 
-    Args:
-        task: The task.
-        flights: The flights.
-        metric: The metric in which a control is to contract.
-        inside: Which instants count, shape (e, steps); those in the metric's region if None.
+    Counted are the instants that are `inside`, shape (e, steps); if None, those in its region.
 
     Returns:
         The largest distance, in the units of the control, and the line of the certificate.

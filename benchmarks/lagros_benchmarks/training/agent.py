@@ -16,12 +16,7 @@ from lagros_policies.learning.networks import Mlp
 
 
 def make_agent(training: Training, venv: VecEnv) -> BaseAlgorithm:
-    """Return the untrained agent of a training run.
-
-    Args:
-        training: The run.
-        venv: Its worlds, one row for each agent.
-    """
+    """Return the untrained agent of a training run in its worlds, one row for each agent."""
     algorithm = training.algorithm
     common: dict[str, Any] = {
         "learning_rate": algorithm.learning_rate,
@@ -75,11 +70,8 @@ def _buffered(algorithm: OffPolicy) -> dict[str, Any]:
 def actor_network(model: BaseAlgorithm) -> Mlp:
     """Return the network of the mean action, before it is clipped or squashed.
 
-    Args:
-        model: A PPO, SAC or TD3 of the policy "MlpPolicy".
-
     Raises:
-        ValueError: The actor is not a plain network of tanh layers.
+        ValueError: The model is no PPO, SAC or TD3, or its actor no plain network of tanh layers.
     """
     policy: Any = model.policy
     if getattr(model, "use_sde", False):

@@ -102,12 +102,7 @@ def course_of(task: Described) -> Any:
 
 
 def lesson_of(training: Training, parallel_env: bool = False) -> Any:
-    """Return the task's part of a run, a `run.Lesson`.
-
-    Args:
-        training: The run.
-        parallel_env: Whether the rows come from PettingZoo's environment, of many agents.
-    """
+    """Return the task's part of a run, a `run.Lesson`, with PettingZoo's rows or ours."""
     return course_of(find_task(training.task)).lesson(training, parallel_env)
 
 

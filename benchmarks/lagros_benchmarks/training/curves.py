@@ -41,11 +41,7 @@ def range_confidence(runs: int) -> float:
 
 
 def curves_of(records: Sequence[dict[str, Any]], command: str) -> dict[str, Any]:
-    """Put the records of runs together, those that differ in the seed alone in one curve.
-
-    Args:
-        records: As `run.train` returns them, of one task.
-        command: What prints the curves again.
+    """Put the records of runs of one task together, in one curve those that differ in the seed.
 
     Returns:
         One entry per algorithm, JSON-serialisable: the figures after every segment with median,
@@ -113,15 +109,7 @@ def _spread(curves: Sequence[Sequence[float]]) -> dict[str, Any]:
 
 
 def draw(curves: dict[str, Any], path: str | Path) -> Path:
-    """Draw the curves of `curves_of`: lines are medians, bands the range of the seeds.
-
-    Args:
-        curves: The curves.
-        path: The figure, .png, .pdf or .svg.
-
-    Returns:
-        The path.
-    """
+    """Draw the curves of `curves_of`: lines are medians, bands the range of the seeds."""
     path = check_figure_path(path)
     task = find_task(curves["task"])
     course = course_of(task)

@@ -70,12 +70,7 @@ class ParallelVecEnv(AlikeVecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set the seed of the next reset, from which all later episodes draw theirs, too.
 
-        Args:
-            seed: Non-negative integer, or None for a random one.
-
-        Returns:
-            The seed of each row's world, as stable-baselines3 seeds environments: one more for
-            each world.
+        Returns the seed of each row's world, as stable-baselines3 seeds them: one more for each.
         """
         self._first = world_seeds(seed, len(self.worlds))
         self._np_random, _ = seeding.np_random(self._first[0])

@@ -133,12 +133,7 @@ class SB3VectorEnv(AlikeVecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set the seed of the next reset.
 
-        Args:
-            seed: Non-negative integer, or None for a random one.
-
-        Returns:
-            The seed of each row's world, as stable-baselines3 seeds environments: one more for
-            each world.
+        Returns the seed of each row's world, as stable-baselines3 seeds them: one more for each.
         """
         worlds = getattr(self.venv.unwrapped, "num_worlds", self.num_envs)
         seeds = world_seeds(seed, worlds)

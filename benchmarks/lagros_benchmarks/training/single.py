@@ -79,14 +79,7 @@ class CorrectedWorlds(VecEnvWrapper):
 
 
 class SingleLesson:
-    """The part of a training run of one body; see `run.Lesson`.
-
-    Args:
-        training: The run.
-
-    Attributes:
-        venv: The worlds as the agent meets them.
-    """
+    """The part of a training run of one body, with the worlds as the agent meets them."""
 
     def __init__(self, training: SingleTraining) -> None:
         """Build the worlds; see the class."""

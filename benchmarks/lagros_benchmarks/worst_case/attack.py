@@ -104,12 +104,7 @@ class AttackSettings:
 
 @dataclass(frozen=True)
 class Attack:
-    """What an attack came to.
-
-    Attributes:
-        row: All figures, as they are published.
-        cases: The sequences found, with what each did.
-    """
+    """What an attack came to: all figures as they are published, and what each sequence did."""
 
     row: dict[str, Any]
     cases: WorstCases
@@ -122,10 +117,6 @@ def bench_of(task: str) -> Any:
 
 def run_attack(settings: AttackSettings, progress: Progress | None = None) -> Attack:
     """Search the worst disturbance of every episode and fly what was found.
-
-    Args:
-        settings: What to attack and how.
-        progress: Told in a few words what is done.
 
     Raises:
         ValueError: The policy keeps a memory, or has no certificate to attack.
@@ -174,12 +165,7 @@ def settings_from(command: Any) -> AttackSettings:
 
 
 def check_shape(pushes: FloatArray, settings: AttackSettings, one: tuple[int, ...]) -> None:
-    """Check that there is a push for every episode, step and state of an attack.
-
-    Args:
-        pushes: Those of all episodes.
-        settings: The attack.
-        one: Shape of those of one episode.
+    """Check that there is a push for every episode of an attack, of the shape `one` each.
 
     Raises:
         ValueError: There are more or fewer.
@@ -192,11 +178,7 @@ def check_shape(pushes: FloatArray, settings: AttackSettings, one: tuple[int, ..
 
 
 def check_bound(pushes: FloatArray, bound: float) -> None:
-    """Check that every push of some sequences lies in the ball of the disturbance.
-
-    Args:
-        pushes: d, shape (..., n), in units of the state per second.
-        bound: d_bar, in the same units.
+    """Check that every push d (..., n) of some sequences lies in the ball of the disturbance.
 
     Raises:
         ValueError: One does not, or is not a number.
@@ -220,8 +202,7 @@ def _row(
     broken = sum(one.broken for one in outcomes)
     scores = [one.score for one in outcomes]
     return {
-        **{name: value for name, value in asdict(settings).items() if name != "search"},
-        "search": asdict(settings.search),
+        **asdict(settings),
         "flights_per_episode": max(one.flights for one in found),
         "search_seconds": seconds,
         "broken_rate": broken / len(outcomes),

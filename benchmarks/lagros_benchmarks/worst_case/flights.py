@@ -97,12 +97,7 @@ def parts_of(states: FloatArray) -> list[FloatArray]:
 
 @dataclass(frozen=True)
 class Planning:
-    """What stands in for the expert of a task without a metric: its planner, and no law.
-
-    Attributes:
-        task: The task.
-        planner: Its planner.
-    """
+    """What stands in for the expert of a task without a metric: its planner, and no law."""
 
     task: Task
     planner: Planner
@@ -127,11 +122,7 @@ def plan_of(planner: Planner, scenario: Scenario) -> Trajectory:
 
 
 def draw_episodes(expert: Any, seeds: Sequence[int]) -> Episodes:
-    """Draw the scenario of each seed, as the environment does, and plan it.
-
-    Args:
-        expert: With its `task` and `planner`.
-        seeds: Of the episodes.
+    """Draw the scenario of each seed, as the environment does, and plan it by the expert's planner.
 
     Raises:
         RuntimeError: No episode has a plan.
@@ -254,13 +245,9 @@ def applied(task: Task, action: NDArray[Any]) -> FloatArray:
 
 
 def fly(episodes: Episodes, law: Law, episode: IntArray, pushes: FloatArray) -> Flights:
-    """Fly a batch in closed loop under given disturbances.
+    """Fly a batch in closed loop, each flight in one of the episodes, shape (b,).
 
-    Args:
-        episodes: The episodes.
-        law: The policy.
-        episode: Which episode each flight belongs to, shape (b,).
-        pushes: d, shape (b, steps, n), in units of the state per second.
+    The pushes are d, shape (b, steps, n), in units of the state per second.
     """
     task, count = episodes.settings, len(episode)
     state, goal, discs = (
@@ -296,16 +283,9 @@ def ahead(task: Task, state: FloatArray, control: FloatArray, push: FloatArray) 
 
 
 def disc_gap(task: Task, before: FloatArray, after: FloatArray, discs: FloatArray) -> FloatArray:
-    """Return the least distance between the body and a disc on a straight way, shape (b,) [m].
+    """Return the least distance to a disc on straight ways between states (b, n), shape (b,) [m].
 
-    Args:
-        task: The task.
-        before: States at the start of the way, shape (b, n).
-        after: States at its end.
-        discs: Shape (b, k, 3); one of radius zero is none.
-
-    Returns:
-        Negative inside a disc; inf where there is none.
+    It is negative inside a disc; inf where there is none, as discs (b, k, 3) of radius zero are.
     """
     if not discs.shape[1]:
         return np.full(len(after), np.inf)

@@ -6,14 +6,13 @@ populations of other searches; `tell` takes the scores back.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-OPTIMISERS = ("cma", "cross-entropy", "random")
 # Share of a population that the cross-entropy method learns from, and how slowly it learns.
 _ELITE = 0.2
 _SMOOTHING = 0.7
@@ -21,55 +20,38 @@ _SMOOTHING = 0.7
 _LEAST_SPREAD = 0.02
 
 
-class Search(Protocol):
-    """An optimiser of one function."""
-
-    def ask(self) -> FloatArray:
-        """Return points to evaluate, shape (population, dimension)."""
-
-    def tell(self, points: FloatArray, scores: FloatArray) -> None:
-        """Take the scores (population,) of those points; larger is better."""
-
-
 class RandomSearch:
-    """Independent normal points: what every other search must beat.
+    """Independent normal points: what every other search, which derives from it, must beat.
 
     Args:
-        dimension: Number of parameters.
+        dimension: Number of parameters, at least two.
         population: Points per question.
         rng: Random generator.
     """
 
     def __init__(self, dimension: int, population: int, rng: np.random.Generator) -> None:
         """Keep the settings."""
-        self._shape, self._rng = (population, dimension), rng
+        self._dimension, self._population, self._rng = dimension, population, rng
 
     def ask(self) -> FloatArray:
-        """Return fresh points."""
-        return self._rng.standard_normal(self._shape)
+        """Return points to evaluate, shape (population, dimension)."""
+        return self._rng.standard_normal((self._population, self._dimension))
 
     def tell(self, points: FloatArray, scores: FloatArray) -> None:
-        """Learn nothing."""
+        """Take the scores (population,) of those points; larger is better."""
 
 
-class CrossEntropySearch:
-    """The cross-entropy method: a normal law with a diagonal spread, fitted to the best fifth.
-
-    Args:
-        dimension: Number of parameters.
-        population: Points per question.
-        rng: Random generator.
-    """
+class CrossEntropySearch(RandomSearch):
+    """The cross-entropy method: a normal law with a diagonal spread, fitted to the best fifth."""
 
     def __init__(self, dimension: int, population: int, rng: np.random.Generator) -> None:
         """Begin with the standard normal law."""
-        self._population, self._rng = population, rng
+        super().__init__(dimension, population, rng)
         self._mean, self._spread = np.zeros(dimension), np.ones(dimension)
 
     def ask(self) -> FloatArray:
         """Return points drawn from the present law."""
-        noise = self._rng.standard_normal((self._population, len(self._mean)))
-        return self._mean + self._spread * noise
+        return self._mean + self._spread * super().ask()
 
     def tell(self, points: FloatArray, scores: FloatArray) -> None:
         """Move mean and spread towards those of the best points."""
@@ -80,13 +62,8 @@ class CrossEntropySearch:
         self._spread += _SMOOTHING * (spread - self._spread)
 
 
-class CmaSearch:
+class CmaSearch(RandomSearch):
     """CMA-ES by the package `cmaes`, begun anew when it has converged.
-
-    Args:
-        dimension: Number of parameters, at least two.
-        population: Points per question.
-        rng: Random generator.
 
     Raises:
         ImportError: The package `cmaes` is not installed.
@@ -94,7 +71,7 @@ class CmaSearch:
 
     def __init__(self, dimension: int, population: int, rng: np.random.Generator) -> None:
         """Begin at the origin."""
-        self._dimension, self._population, self._rng = dimension, population, rng
+        super().__init__(dimension, population, rng)
         self._strategy = self._begin(np.zeros(dimension))
 
     def ask(self) -> FloatArray:
@@ -115,9 +92,17 @@ class CmaSearch:
         return CMA(mean=mean, sigma=1.0, population_size=self._population, seed=seed)
 
 
+_KINDS: dict[str, type[RandomSearch]] = {
+    "cma": CmaSearch,
+    "cross-entropy": CrossEntropySearch,
+    "random": RandomSearch,
+}
+OPTIMISERS = tuple(_KINDS)
+
+
 def make_search(
     name: str, dimension: int, population: int, rng: np.random.Generator
-) -> RandomSearch | CrossEntropySearch | CmaSearch:
+) -> RandomSearch:
     """Return an optimiser by its name, one of `OPTIMISERS`.
 
     Raises:
@@ -126,11 +111,6 @@ def make_search(
     """
     if min(dimension, population) < 2:
         raise ValueError(f"dimension={dimension} and population={population} must be at least 2")
-    kinds: dict[str, type[RandomSearch] | type[CrossEntropySearch] | type[CmaSearch]] = {
-        "cma": CmaSearch,
-        "cross-entropy": CrossEntropySearch,
-        "random": RandomSearch,
-    }
-    if name not in kinds:
+    if name not in _KINDS:
         raise ValueError(f"optimiser {name!r} must be one of {', '.join(OPTIMISERS)}")
-    return kinds[name](dimension, population, rng)
+    return _KINDS[name](dimension, population, rng)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.worst_case.optimisers import OPTIMISERS, make_search
-from lagros_benchmarks.worst_case.sequences import PARAMETRISATIONS, Parametrisation
+from lagros_benchmarks.worst_case.sequences import PARAMETRISATIONS
 from lagros_envs.checks import check_fields, check_name, check_whole
 from lagros_envs.disturbances import into_unit_ball, onto_unit_sphere
 
@@ -114,23 +114,13 @@ class Found:
     flights: int
 
 
-@dataclass
 class _Pool:
     """The best sequences so far of every episode, best first, and what they cost."""
 
-    size: int
-    sequences: list[FloatArray]
-    scores: list[FloatArray]
-    flights: int = 0
-
-    @classmethod
-    def empty(cls, target: Target, size: int) -> _Pool:
-        shape = (0, target.steps, target.channels)
-        return cls(
-            size,
-            [np.empty(shape) for _ in range(target.episodes)],
-            [np.empty(0) for _ in range(target.episodes)],
-        )
+    def __init__(self, target: Target, size: int) -> None:
+        self.size, self.flights = size, 0
+        self.sequences = [np.empty((0, target.steps, target.channels))] * target.episodes
+        self.scores = [np.empty(0)] * target.episodes
 
     def add(self, sequences: FloatArray, scores: FloatArray) -> None:
         """Take sequences (episodes, k, steps, channels) with their scores (episodes, k)."""
@@ -143,15 +133,7 @@ class _Pool:
 
 
 def search(target: Target, settings: SearchSettings, seed: int = 0) -> list[Found]:
-    """Search the worst sequence of every episode of a target.
-
-    Args:
-        target: What is attacked.
-        settings: How.
-        seed: Seed of the search; episodes draw independently.
-
-    Returns:
-        One result per episode.
+    """Search the worst sequence of every episode of a target, each with its own stream of the seed.
 
     Raises:
         ValueError: The method is "gradient" and the target has no slopes.
@@ -161,7 +143,7 @@ def search(target: Target, settings: SearchSettings, seed: int = 0) -> list[Foun
         raise ValueError("method='gradient' needs a target with slopes; use 'hybrid'")
     children = np.random.SeedSequence(seed).spawn(target.episodes)
     streams = [np.random.default_rng(child) for child in children]
-    pool = _Pool.empty(target, settings.restarts)
+    pool = _Pool(target, settings.restarts)
     _try(target, pool, target.starts()[:, : settings.budget])
     if settings.method == "gradient":
         _try(target, pool, _random_starts(target, settings.restarts, streams))
@@ -199,7 +181,7 @@ def _explore(
     budget: float,
 ) -> None:
     """Let one optimiser per episode ask, until the budget is spent."""
-    kind: Parametrisation = PARAMETRISATIONS[settings.parametrisation](
+    kind = PARAMETRISATIONS[settings.parametrisation](
         target.steps, target.channels, settings.pieces
     )
     searches = [make_search(name, kind.dimension, settings.population, rng) for rng in streams]

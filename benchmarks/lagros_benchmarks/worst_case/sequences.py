@@ -7,7 +7,7 @@ optimiser can move freely and the bound d_bar holds whatever it proposes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,20 +17,9 @@ from lagros_envs.disturbances import Situation, into_unit_ball, onto_unit_sphere
 FloatArray = NDArray[np.float64]
 
 
-class Parametrisation(Protocol):
-    """A map from vectors to sequences in the unit ball."""
-
-    @property
-    def dimension(self) -> int:
-        """Number of parameters."""
-
-    def sequences(self, points: FloatArray) -> FloatArray:
-        """Return sequences (p, steps, channels) in the unit ball for points (p, dimension)."""
-
-
 @dataclass(frozen=True)
-class _Pieces:
-    """Sequences over pieces of the episode: the numbers that every parametrisation has.
+class Parametrisation:
+    """A map from vectors to sequences in the unit ball, over pieces of the episode.
 
     Attributes:
         steps: Control steps of the episode.
@@ -53,36 +42,28 @@ class _Pieces:
                 "at least 1, and pieces at most steps"
             )
 
-
-class Segments(_Pieces):
-    """One direction per segment of the episode, always of length one.
-
-    Attributes:
-        steps: Control steps of the episode.
-        channels: Coordinates of d.
-        pieces: Segments, of equal length but for rounding.
-    """
-
     @property
     def dimension(self) -> int:
-        """One vector per piece."""
+        """Number of parameters: one vector per piece."""
         return self.pieces * self.channels
 
     def sequences(self, points: FloatArray) -> FloatArray:
-        """Return sequences (p, steps, channels) of length one for points (p, dimension)."""
+        """Return sequences (p, steps, channels) in the unit ball for points (p, dimension)."""
+        raise NotImplementedError
+
+
+class Segments(Parametrisation):
+    """One direction per piece, of equal length but for rounding; every push has length one."""
+
+    def sequences(self, points: FloatArray) -> FloatArray:
+        """Return sequences; see `Parametrisation`."""
         rays = _unit(points.reshape(len(points), self.pieces, self.channels))
         piece = np.arange(self.steps) * self.pieces // self.steps
         return rays[:, piece]
 
 
-class Knots(_Pieces):
-    """Vectors at equidistant knots, linear between them, shortened to length one.
-
-    Attributes:
-        steps: Control steps of the episode.
-        channels: Coordinates of d.
-        pieces: Intervals between the knots.
-    """
+class Knots(Parametrisation):
+    """Vectors at the ends of the pieces, linear between them, shortened to length one."""
 
     @property
     def dimension(self) -> int:
@@ -90,7 +71,7 @@ class Knots(_Pieces):
         return (self.pieces + 1) * self.channels
 
     def sequences(self, points: FloatArray) -> FloatArray:
-        """Return sequences (p, steps, channels) in the unit ball for points (p, dimension)."""
+        """Return sequences; see `Parametrisation`."""
         values = points.reshape(len(points), self.pieces + 1, self.channels)
         place = np.linspace(0.0, self.pieces, self.steps)
         left = np.minimum(place.astype(np.intp), self.pieces - 1)
@@ -98,14 +79,8 @@ class Knots(_Pieces):
         return into_unit_ball((1.0 - share) * values[:, left] + share * values[:, left + 1])
 
 
-class Switching(_Pieces):
-    """One direction whose sign switches at a few free times: bang-bang.
-
-    Attributes:
-        steps: Control steps of the episode.
-        channels: Coordinates of d.
-        pieces: Constant pieces; there is one switch less.
-    """
+class Switching(Parametrisation):
+    """One direction whose sign switches between the pieces, at free times: bang-bang."""
 
     @property
     def dimension(self) -> int:
@@ -113,7 +88,7 @@ class Switching(_Pieces):
         return self.channels + self.pieces - 1
 
     def sequences(self, points: FloatArray) -> FloatArray:
-        """Return sequences (p, steps, channels) of length one for points (p, dimension)."""
+        """Return sequences; see `Parametrisation`."""
         direction = _unit(points[:, : self.channels])
         # A logistic map keeps the times inside the episode without a bound for the optimiser.
         times = self.steps / (1.0 + np.exp(-np.clip(points[:, self.channels :], -30.0, 30.0)))
@@ -122,7 +97,7 @@ class Switching(_Pieces):
         return np.asarray(sign[..., None] * direction[:, None, :])
 
 
-PARAMETRISATIONS: dict[str, type[Segments] | type[Knots] | type[Switching]] = {
+PARAMETRISATIONS: dict[str, type[Parametrisation]] = {
     "segments": Segments,
     "knots": Knots,
     "switching": Switching,

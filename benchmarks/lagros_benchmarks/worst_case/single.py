@@ -263,14 +263,7 @@ class SingleBench:
 def replay_single(
     episodes: Episodes, index: int, policy: BasePolicy, goal: str, pushes: FloatArray
 ) -> tuple[Outcome, Flights | None]:
-    """Fly one sequence in the environment.
-
-    Args:
-        episodes: The episodes.
-        index: Which of them.
-        policy: The policy.
-        goal: As for `goals.profile`.
-        pushes: d, shape (steps, n).
+    """Fly one sequence d (steps, n) in the environment of an episode, with a goal of `GOALS`.
 
     Returns:
         The outcome, and the flight for further questions; None where it raised.

@@ -1,4 +1,4 @@
-"""What an attack on the cart-pole says besides, and its bound of the control's gain."""
+"""What an attack on the cart-pole says besides."""
 
 from __future__ import annotations
 

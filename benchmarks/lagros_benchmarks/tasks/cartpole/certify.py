@@ -58,12 +58,7 @@ _LARGEST = 150
 
 
 def certify(task: CartPoleSettings, question: Question) -> Certificate:
-    """Return the cart-pole's certificate.
-
-    Args:
-        task: The task.
-        question: What is asked. "lagros" is asked about with its recorded learning error;
-            "tube-mpc" is u*.
+    """Return the cart-pole's certificate; of "lagros" with its recorded learning error.
 
     Raises:
         ValueError: The file is no metric.
@@ -119,11 +114,8 @@ def instants_in(box: ProofBox, flights: SingleFlights) -> np.ndarray:
 def cartpole_tubes(system: CartPole, bound: float) -> list[ConstantTube]:
     """Design the ellipsoids of the certificate: near the upright, and for all settled plans.
 
-    Where a bound is too large for a tube to keep itself in its box, there is none, and no claim.
-
-    Args:
-        system: The cart-pole.
-        bound: d_bar of the first; the second is for `PAPER_BOUND`.
+    The first is for the `bound` d_bar, the second for `PAPER_BOUND`. Where one is too large for a
+    tube to keep itself in its box, there is none, and no claim.
     """
     wanted = [
         (
@@ -145,12 +137,8 @@ def cartpole_tubes(system: CartPole, bound: float) -> list[ConstantTube]:
 def cartpole_held_tubes(system: CartPole, bound: float) -> list[HeldTube]:
     """Design the tubes of a held control: near the upright, and for all settled plans.
 
-    Where there is none that keeps itself in its box, there is no claim.
-
-    Args:
-        system: The cart-pole.
-        bound: d_bar of the first, whose control is held for 20 ms; the second is for `PAPER_BOUND`,
-            held for the 0.1 s of the task.
+    The first is for d_bar = `bound`, held 20 ms, the second for `PAPER_BOUND`, held the 0.1 s
+    of the task. Where there is none that keeps itself in its box, there is no claim.
     """
     wanted = [
         (_UPRIGHT, HeldDesign(0.02, 0.4, _ANGLE, disturbance_bound=bound, degree=3)),
@@ -171,11 +159,7 @@ def _contained(
 
 
 def metric_to_prove(path: Path | None) -> tuple[Path | None, bool]:
-    """Return which metric to load, and whether the large box is claimed for it.
-
-    Args:
-        path: The user's file, which is asked for what ours is; None for ours.
-    """
+    """Return which metric to load, a user's or ours, and whether the large box is claimed."""
     folder = Path(lagros_policies.__file__).parent / "pretrained"
     ours = folder / PROVED_FILE
     if path is not None:
@@ -188,14 +172,9 @@ def cartpole_proofs(
 ) -> tuple[ProofBox, Sequence[Statement] | None]:
     """Prove (14) and the condition over a hold on the boxes of the shipped metric.
 
-    Args:
-        metric: The metric.
-        most_seconds: Time for each search [s].
-        large: Whether the large boxes are claimed; otherwise the small one, whose proof is left to
-            the certificate.
-
     Returns:
-        The box of x, x_d and u_d, and the statements, or None if they are still to be made.
+        The box of x, x_d and u_d, and the statements. Where the large boxes are not claimed, these
+        are the small one and None: its proof is left to the certificate.
     """
     if not large:
         return SMALL_BOX, None
@@ -204,10 +183,7 @@ def cartpole_proofs(
 
 
 def load_cartpole_metric(path: Path | None) -> Metric:
-    """Read a metric of the cart-pole.
-
-    Args:
-        path: A file of `save_metric`; None for the one that the policies use.
+    """Read a metric of the cart-pole from a file, or the one that the policies use.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -226,10 +202,7 @@ def prove_multiple(
 ) -> tuple[ProofBox, Proof, Proof]:
     """Prove (14) and the condition over a hold on a multiple of the boxes of the shipped metric.
 
-    Args:
-        metric: The metric.
-        factor: The multiple; the share of the lean stays.
-        most_seconds: Processor time of each search [s].
+    The share of the lean stays; each search takes so much processor time [s] at most.
 
     Returns:
         The box of x, x_d and u_d, the proof on it, and that for forces that lean with the pole.
@@ -245,10 +218,6 @@ def prove_multiple(
 
 def largest_proofs(metric: Metric, most_seconds: float) -> tuple[ProofBox, Sequence[Statement]]:
     """Find the largest multiple of the boxes of the shipped metric on which all can be proved.
-
-    Args:
-        metric: The metric.
-        most_seconds: Processor time of each search [s].
 
     Returns:
         The box of x, x_d and u_d and what was proved on it, and which multiple it is; the whole

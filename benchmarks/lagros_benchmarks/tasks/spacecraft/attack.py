@@ -141,12 +141,7 @@ class SpacecraftBench:
 
 
 def replay_spacecraft(target: SpacecraftTarget, pushes: FloatArray) -> Outcome:
-    """Fly one sequence in a world of its own.
-
-    Args:
-        target: The world, the policy and the goal.
-        pushes: d, shape (steps, agents, 6).
-    """
+    """Fly one sequence d (steps, agents, 6) in a world of its own."""
     given = Replay(pushes, task.SpacecraftSettings().control_period)
     with Attempt() as attempt:
         flown = target.fly(target.environment(1, given))

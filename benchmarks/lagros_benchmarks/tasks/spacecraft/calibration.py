@@ -34,16 +34,13 @@ def spacecraft_scores(
     """Fly worlds of the centralised policy and return the largest position error of each.
 
     Args:
-        count: n, worlds.
+        count: Worlds.
         namespace: Of the seeds.
         seed: Seed of the run.
         kind: Kind of the disturbance.
         bound: d_bar, in units of the state per second.
         preset: Preset of the scenarios.
         agents: Agents of each world.
-
-    Returns:
-        `POSITION_ERROR` of every world.
     """
     begun = perf_counter()
 
@@ -76,11 +73,7 @@ def spacecraft_statements(
 ) -> list[Statement]:
     """Return the calibrated line of the spacecraft's certificate: the position's tube.
 
-    Args:
-        level: Probability of the bound.
-        worlds: Calibration worlds; about a second each.
-        kind: Kind of the disturbance.
-        bound: d_bar, in units of the state per second.
+    Its probability is `level`; each world takes about a second.
 
     Raises:
         ValueError: There are too few worlds for the level.

@@ -31,10 +31,7 @@ _PLANE_RATE, _TURNING_RATE = 2.0, 0.3
 def certify(task: SpacecraftSettings, question: Question) -> Certificate:
     """Return the spacecraft's certificate; its proofs are exact and take milliseconds.
 
-    Args:
-        task: The task.
-        question: What is asked, the metric being one of the axes. "lagros" is asked about with its
-            recorded learning error; "centralized" is u*.
+    The metric is one of the axes; "lagros" has its recorded learning error, "centralized" is u*.
 
     Raises:
         UnservedError: `largest` is asked for.
@@ -101,11 +98,7 @@ def fly_spacecraft(
 ) -> tuple[list[Statement], float]:
     """Fly worlds of the centralised policy, which tracks with u*, against the certified margin.
 
-    Args:
-        found: The certificate, with its `position_held_without_learning_error`.
-        policy: Whose certificate it is; a network shows no x_d to hold it against.
-        bound: d_bar, in units of the state per second.
-        worlds: Worlds of six agents.
+    A network, if the certificate is a network's, shows no x_d to hold it against.
 
     Returns:
         The statement, and the largest position error [m].

@@ -87,12 +87,7 @@ class WorldRecord(Keepable):
 
 @dataclass(frozen=True)
 class Flight(Keepable):
-    """Some worlds flown by one policy.
-
-    Attributes:
-        worlds: One record per world.
-        counters: What the policy counts, summed over the worlds.
-    """
+    """Some worlds flown by one policy, and what it counts, summed over the worlds."""
 
     worlds: tuple[WorldRecord, ...]
     counters: dict[str, int]
@@ -198,13 +193,7 @@ def shapes_of(policy: BasePolicy, worlds: int, agents: int) -> list[tuple[int, .
 
 
 def make_filter(policy: BasePolicy, env: Any, disturbance_bound: float) -> BasePolicy:
-    """Return a policy that uses the safety filter.
-
-    Args:
-        policy: The policy.
-        env: An environment of spacecraft; its task and preset are taken.
-        disturbance_bound: d_bar, in units of the state per second.
-    """
+    """Return a policy with the safety filter of an environment's task and preset, at a bound."""
     from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 
     return SafetyFilter(policy, env.settings, env.preset, disturbance_bound=disturbance_bound)
@@ -213,18 +202,11 @@ def make_filter(policy: BasePolicy, env: Any, disturbance_bound: float) -> BaseP
 def fly(
     loop: WorldsLoop, seeds: Sequence[int], margin: float | None = None, trace: Trace | None = None
 ) -> Flight:
-    """Fly one batch of worlds to their end.
+    """Fly one batch of worlds, one per seed and without autoreset, to their end.
 
     An exception in the policy or the environment ends the batch; it is written down and not raised.
-
-    Args:
-        loop: The worlds, one per seed, without autoreset, and the policy.
-        seeds: Seeds of the episodes.
-        margin: Certified bound of the position error to x_d [m], or None.
-        trace: Filled as the batch flies; for those who want more than the records.
-
-    Returns:
-        The records and counters.
+    The margin is the certified bound of the position error to x_d [m], or None. A trace, for those
+    who want more than the records, is filled as the batch flies.
     """
     trace = Trace() if trace is None else trace
     counters: dict[str, int] = {}
@@ -241,12 +223,6 @@ def fly_chunk(
     make_env: Any, policy: Any, seeds: Sequence[int], margin: float | None = None
 ) -> Flight:
     """Fly worlds in one batch, and one by one where that raises or the policy draws for itself.
-
-    Args:
-        make_env: Number of worlds to a `SpacecraftVectorEnv`.
-        policy: The policy, or an object with its `predict`.
-        seeds: Seeds of the episodes.
-        margin: As for `fly`.
 
     Returns:
         The records, in the order of the seeds, and the counters.

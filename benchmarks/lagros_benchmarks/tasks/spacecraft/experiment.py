@@ -33,11 +33,7 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True)
 class SpacecraftRun(BenchmarkRun):
-    """All worlds of a spacecraft benchmark.
-
-    Attributes:
-        counters: What the policy of each case counts, summed over the worlds.
-    """
+    """All worlds of a spacecraft benchmark, and what the policy of each case counts in them."""
 
     episodes: Mapping[Case, Sequence[WorldRecord]]
     timing: Mapping[Case, Sequence[Timing]]
@@ -192,15 +188,10 @@ class SpacecraftExperiment:
 
 
 def fly_scene(settings: BenchmarkSettings, world: int, toolbox: Toolbox) -> Scene:
-    """Fly one world of a run again with every policy, and keep where everybody was.
+    """Fly one world of a run again, from 0, with every policy, and keep where everybody was.
 
     With several bounds or numbers of agents it is the middle one (the lower of two); with the
     filter only where the run has no policy without it.
-
-    Args:
-        settings: Those of the run.
-        world: Which of its worlds, from 0.
-        toolbox: As for `run_benchmark`.
 
     Raises:
         ValueError: The run has no such world.

@@ -54,13 +54,6 @@ def draw(rows: Sequence[Row], path: str | Path) -> Path:
     """Draw success and effort against the bound, or success and time against the number of agents.
 
     Where there is one condition, success and effort of each policy are drawn side by side.
-
-    Args:
-        rows: Rows of any conditions.
-        path: The figure, .png, .pdf or .svg.
-
-    Returns:
-        The path.
     """
     path = check_figure_path(path)
     if len({row["agents"] for row in rows}) > 1:

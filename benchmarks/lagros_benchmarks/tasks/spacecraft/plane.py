@@ -112,22 +112,11 @@ class PlaneTarget:
 
 
 def plane_target(tracking: AxesTracking, bound: float) -> PlaneTarget:
-    """Return the loop of a tracking law.
-
-    Args:
-        tracking: u* or the sliding-variable law.
-        bound: d_bar, in units of the state per second.
-    """
+    """Return the loop of a tracking law, u* or the sliding-variable law, under the bound d_bar."""
     return PlaneTarget(tracking.laws[0], bound, tracking.plane.period)
 
 
 def worst_plane_pushes(tracking: AxesTracking, bound: float, steps: int) -> FloatArray:
-    """Return the d/d_bar of position and velocity that the search finds, shape (steps, 2).
-
-    Args:
-        tracking: The tracking law.
-        bound: d_bar, in units of the state per second.
-        steps: Control steps; the sequence is repeated over them.
-    """
+    """Return the d/d_bar of position and velocity that the search finds, shape (steps, 2)."""
     found = search(plane_target(tracking, bound), _SEARCH)[0].sequence
     return np.asarray(found[np.arange(steps) % len(found)])

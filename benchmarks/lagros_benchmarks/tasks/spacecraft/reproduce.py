@@ -133,11 +133,7 @@ class SpacecraftReproduceSettings:
             learner = stage.fit(name, training, parts, _held_out_part(met, self.held_out))
 
     def benchmark(self, folder: Path | None) -> BenchmarkSettings:
-        """Return the benchmark of (a), (b), (c) and (d).
-
-        Args:
-            folder: Where the weights lie; None takes the shipped ones.
-        """
+        """Return the benchmark of (a), (b), (c) and (d), with a folder's weights or ours."""
         weights = {}
         if folder is not None:
             weights = {name: {"weights": str(_weights(folder, name))} for name in _NETWORKS}
@@ -248,12 +244,7 @@ def _split(data: FlightData, share: float) -> np.ndarray[Any, np.dtype[np.bool_]
 
 
 def training_part(data: FlightData, settings: SpacecraftReproduceSettings) -> FlightData:
-    """Return what is learned from flights of a network: labels of a sane size, nobody at rest.
-
-    Args:
-        data: The flights, labelled.
-        settings: Which labels are too long, who is at rest, and what is held out.
-    """
+    """Return what is learned from flights of a network: labels of a sane size, nobody at rest."""
     sensed = Sensed.of(data.layout, data.observation)
     slow = np.linalg.norm(sensed.velocity, axis=-1) < settings.least_speed
     far = np.linalg.norm(sensed.goal, axis=-1) > _FAR

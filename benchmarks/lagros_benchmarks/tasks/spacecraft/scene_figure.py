@@ -43,13 +43,6 @@ def scene_figure(scene: Scene, path: str | Path) -> Path:
 
     Agents are drawn as their discs every five seconds. A path is strong until the agent arrives or
     collides and faint after; a collision is a red cross on the agent's disc.
-
-    Args:
-        scene: The world and the flights.
-        path: The figure, .png, .pdf or .svg.
-
-    Returns:
-        The path.
     """
     path = check_figure_path(path)
     columns = min(len(scene.panels), _MOST_COLUMNS)

@@ -97,11 +97,7 @@ def ordered(group: Sequence[Row]) -> Sequence[Row]:
 
 
 def comparison_lines(group: Sequence[Row]) -> Iterator[str]:
-    """Yield how each policy differs from the next one, filtered alike, and what the filter does.
-
-    Args:
-        group: Rows of one condition.
-    """
+    """Yield how each policy differs from the next one, filtered alike, and what the filter does."""
     for filtered in (False, True):
         rows = [row for row in group if row["safety_filter"] is filtered]
         if len(rows) > 1:

@@ -41,19 +41,11 @@ class Timing(Keepable):
 
 
 def time_policy(env: SpacecraftVectorEnv, policy: BasePolicy, seeds: Sequence[int]) -> Timing:
-    """Fly the episodes again for the times of the calls.
+    """Fly the episodes again, in one world without autoreset, for the times of the calls.
 
     A local policy is called twice at every step: for all agents of the world, which flies it, and
     for one of them alone with a memory of its own, as it would run on board. The agent changes from
     world to world. What raises ends the times of its episode, and is counted.
-
-    Args:
-        env: One world, without autoreset.
-        policy: The policy.
-        seeds: Seeds of the episodes.
-
-    Returns:
-        The times.
     """
     loop = WorldsLoop(env, policy)
     steps: list[float] = []

@@ -160,10 +160,6 @@ class SpacecraftLesson:
     Args:
         training: The run.
         parallel_env: Whether the rows come from PettingZoo's environment, one world at a time.
-
-    Attributes:
-        venv: The worlds as the agents meet them.
-        shaped: The reward in them.
     """
 
     def __init__(self, training: SpacecraftTraining, parallel_env: bool = False) -> None:
@@ -275,16 +271,8 @@ def evaluate(
 ) -> dict[str, NDArray[Any]]:
     """Fly a policy through whole episodes of the task and return its measures, agent by agent.
 
-    Args:
-        policy: The policy.
-        preset: Preset of the scenarios.
-        agents: Number of agents in each world.
-        seeds: Seed of each world.
-        disturbance: Kind of disturbance.
-        bound: d_bar, in units of the state per second.
-
-    Returns:
-        The environment's own measures at the end of the episode, each of shape (worlds * agents,).
+    There is a world for each seed. The measures are the environment's own at the end of the
+    episode, each of shape (worlds * agents,).
     """
     env = SpacecraftVectorEnv(
         len(seeds) * agents,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop
+from lagros_benchmarks.worst_case.goals import GOALS
 from lagros_envs.disturbances import Situation, onto_unit_sphere
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
@@ -24,7 +25,6 @@ from lagros_policies.policy import BasePolicy, as_policy
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-GOALS = ("tube", "success", "clearance")
 # Towards the nearest thing, across that, away from the goal, along the own way, away from the plan,
 # along both axes of the arena; the lookahead; how d divides between position and velocity.
 PARAMETERS = 9
@@ -211,10 +211,8 @@ class SpacecraftTarget:
     def fly(self, env: SpacecraftVectorEnv, pushes: FloatArray | None = None) -> SpacecraftFlights:
         """Fly all worlds of an environment to the time limit.
 
-        Args:
-            env: The worlds.
-            pushes: Filled as they fly, shape (worlds, steps, agents, 6), for those who want to know
-                how far the worlds came where the policy raises.
+        The pushes (worlds, steps, agents, 6) are filled as they fly, for those who want to know how
+        far the worlds came where the policy raises.
         """
         shape = (env.num_worlds, self.agents)
         loop = WorldsLoop(env, self.policy, past_the_end=True)
@@ -271,12 +269,7 @@ def first_adversaries() -> FloatArray:
 
 
 def least_gap(positions: FloatArray, scenario: Scenario) -> FloatArray:
-    """Return the least distance between surfaces, shape (worlds,) [m].
-
-    Args:
-        positions: Shape (worlds, agents, 2) [m].
-        scenario: Radii and obstacles.
-    """
+    """Return the least distance between surfaces, shape (worlds,) [m], at (worlds, agents, 2)."""
     first, second = np.triu_indices(positions.shape[1], 1)
     apart = np.linalg.norm(positions[:, first] - positions[:, second], axis=-1)
     gaps = [apart - 2.0 * scenario.agent_radius]
@@ -287,11 +280,7 @@ def least_gap(positions: FloatArray, scenario: Scenario) -> FloatArray:
 
 
 class PlansOnce:
-    """A joint planner that answers the same question only once.
-
-    Args:
-        planner: The planner.
-    """
+    """A joint planner that answers the same question only once."""
 
     def __init__(self, planner: Any) -> None:
         """Remember nothing yet."""
