@@ -124,7 +124,6 @@ class Delivery:
     """
 
     def __init__(self) -> None:
-        """Begin with nothing written."""
         self.written: list[Path] = []
         self.problems: list[str] = []
         self._texts: list[str] = []

@@ -136,6 +136,19 @@ def curve(values: Any) -> FloatArray:
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
 
 
+def legend(figure: Figure, axes: Axes) -> None:
+    """Write the names of the lines of one panel above all of them."""
+    handles, names = axes.get_legend_handles_labels()
+    figure.legend(
+        handles,
+        names,
+        loc="outside upper left",
+        ncols=min(len(names), 4),
+        frameon=False,
+        handlelength=3.5,
+    )
+
+
 def caption(figure: Figure, text: str) -> None:
     """Write a few lines below a figure."""
     figure.supxlabel(text, fontsize=8, color="#444444", x=0.01, ha="left")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from lagros_benchmarks.report.canvas import (
     caption,
     check_figure_path,
     curve,
+    legend,
     log_ordinate,
     save,
     styles,
@@ -152,12 +153,11 @@ def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
     figure.supxlabel(f"disturbance bound d̄  [state units/s]{note}", fontsize=10)
     figure.supylabel("success [%], 95 % interval", fontsize=10)
     handles, names = panels[0].get_legend_handles_labels()
-    look: dict[str, Any] = {"frameon": False, "handlelength": 3.5}
     if len(kinds) < len(panels) and len(names) <= _LONGEST_LEGEND:
-        panels[len(kinds)].legend(handles, names, loc="center left", **look)
+        empty = panels[len(kinds)]
+        empty.legend(handles, names, loc="center left", frameon=False, handlelength=3.5)
     else:
-        columns = min(len(names), 4)
-        figure.legend(handles, names, loc="outside upper left", ncols=columns, **look)
+        legend(figure, panels[0])
     return save(figure, path)
 
 

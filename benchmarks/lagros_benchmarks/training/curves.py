@@ -18,6 +18,7 @@ from lagros_benchmarks.report.canvas import (
     caption,
     check_figure_path,
     curve,
+    legend,
     save,
     styles,
 )
@@ -135,10 +136,7 @@ def draw(curves: dict[str, Any], path: str | Path) -> Path:
         panel.set_title(title, loc="left", fontsize=10)
         if factor == 100.0:
             panel.set_ylim(-4.0, 104.0)
-    handles, names = axes[0].get_legend_handles_labels()
-    figure.legend(
-        handles, names, loc="outside upper left", ncols=4, frameon=False, handlelength=3.5
-    )
+    legend(figure, axes[0])
     axes[-1].set_xlim(left=0.0)
     axes[-1].set_xlabel(course.abscissa)
     caption(figure, _caption(curves))

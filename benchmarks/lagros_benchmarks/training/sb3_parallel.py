@@ -36,7 +36,6 @@ class ParallelVecEnv(AlikeVecEnv):
     """
 
     def __init__(self, worlds: Sequence[ParallelEnv[Any, Any, Any]] | ParallelEnv[Any, Any, Any]):
-        """Wrap the environments; see the class."""
         # PettingZoo's own annotations are partial.
         self.worlds: list[Any] = list(worlds) if isinstance(worlds, Sequence) else [worlds]
         if not self.worlds:

@@ -114,7 +114,6 @@ class SB3VectorEnv(AlikeVecEnv):
     """
 
     def __init__(self, venv: gym.vector.VectorEnv[Any, Any, Any]) -> None:
-        """Wrap the environment; see the class."""
         if not isinstance(venv, gym.vector.VectorEnv):
             raise ValueError(
                 f"venv={shown(venv)} must be a vector environment, such as gym.make_vec("
@@ -203,7 +202,6 @@ class LinearFeatures(VecEnvWrapper):
     """
 
     def __init__(self, venv: VecEnv, matrix: NDArray[np.float64]) -> None:
-        """Wrap the environment; see the class."""
         if matrix.ndim != 2 or (matrix.shape[1],) != venv.observation_space.shape:
             raise ValueError(
                 f"matrix has shape {matrix.shape}; it must be (k, n) with n of the observation's "

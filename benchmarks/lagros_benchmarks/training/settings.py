@@ -48,7 +48,6 @@ class _Ranged:
     widths: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        """Check types and ranges."""
         check_fields(self)
         for name in self.positive:
             check_positive(name, getattr(self, name))
@@ -206,7 +205,6 @@ class Training(_Ranged):
     final_episodes: int = 1000
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         if self.effort_weight is not None:
             check_not_negative("effort_weight", self.effort_weight)
@@ -270,7 +268,6 @@ class SingleTraining(Training):
     task: str = field(default_factory=first_task)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         described = self.described
         names = {item.name for item in fields(described)}

@@ -48,7 +48,6 @@ class CorrectedWorlds(VecEnvWrapper):
     def __init__(
         self, venv: VecEnv, base: BasePolicy, largest_correction: float, control_scale: Numbers
     ) -> None:
-        """Wrap the environment; see the class."""
         shape = (len(control_scale),)
         super().__init__(venv, action_space=spaces.Box(-1.0, 1.0, shape, np.float32))
         self.base = base
@@ -82,7 +81,6 @@ class SingleLesson:
     """The part of a training run of one body, with the worlds as the agent meets them."""
 
     def __init__(self, training: SingleTraining) -> None:
-        """Build the worlds; see the class."""
         self.training = training
         task: Any = training.described
         if training.effort_weight is not None:

@@ -70,7 +70,6 @@ class AttackSettings:
     agents: int = 6
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         check_fields(self)
         find_task(self.task)
         check_policy(self.policy, self.task)

@@ -30,7 +30,6 @@ class RandomSearch:
     """
 
     def __init__(self, dimension: int, population: int, rng: np.random.Generator) -> None:
-        """Keep the settings."""
         self._dimension, self._population, self._rng = dimension, population, rng
 
     def ask(self) -> FloatArray:
@@ -45,7 +44,6 @@ class CrossEntropySearch(RandomSearch):
     """The cross-entropy method: a normal law with a diagonal spread, fitted to the best fifth."""
 
     def __init__(self, dimension: int, population: int, rng: np.random.Generator) -> None:
-        """Begin with the standard normal law."""
         super().__init__(dimension, population, rng)
         self._mean, self._spread = np.zeros(dimension), np.ones(dimension)
 
@@ -70,7 +68,6 @@ class CmaSearch(RandomSearch):
     """
 
     def __init__(self, dimension: int, population: int, rng: np.random.Generator) -> None:
-        """Begin at the origin."""
         super().__init__(dimension, population, rng)
         self._strategy = self._begin(np.zeros(dimension))
 

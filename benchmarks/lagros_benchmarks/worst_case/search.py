@@ -87,7 +87,6 @@ class SearchSettings:
     restarts: int = 8
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         check_fields(self)
         for name, valid in (
             ("method", METHODS),

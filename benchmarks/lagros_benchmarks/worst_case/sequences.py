@@ -35,7 +35,6 @@ class Parametrisation:
     pieces: int
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if min(self.steps, self.channels, self.pieces) < 1 or self.pieces > self.steps:
             raise ValueError(
                 f"steps={self.steps}, channels={self.channels} and pieces={self.pieces} must be "
@@ -121,7 +120,6 @@ class Replay:
     period: float
 
     def __post_init__(self) -> None:
-        """Check the sequence."""
         if self.pushes.ndim < 2 or len(self.pushes) == 0 or not np.all(np.isfinite(self.pushes)):
             raise ValueError(
                 f"pushes of shape {self.pushes.shape} must be finite, with one row per control step"

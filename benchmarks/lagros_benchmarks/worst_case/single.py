@@ -143,7 +143,6 @@ class SingleBench:
     population = 30
 
     def __init__(self, settings: Any) -> None:
-        """Find the task."""
         self.settings = settings
         self.task = cast(Task, find_task(settings.task))
         self.shape = (self.task.steps, self.task.system.state_dim)

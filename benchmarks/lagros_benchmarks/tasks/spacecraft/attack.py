@@ -46,7 +46,6 @@ class SpacecraftBench:
     population = 16
 
     def __init__(self, settings: Any) -> None:
-        """Keep the settings."""
         self.settings = settings
         self.task = task.SpacecraftSettings()
         self.shape = (self.task.steps, settings.agents, task.STATE_DIM)

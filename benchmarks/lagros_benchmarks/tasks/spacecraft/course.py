@@ -95,7 +95,6 @@ class SpacecraftTraining(Training):
     final_presets: tuple[str, ...] = ("paper", "open")
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         for preset in (self.preset, *self.final_presets):
             check_name("preset", preset, PRESETS)

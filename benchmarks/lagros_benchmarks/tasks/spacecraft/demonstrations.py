@@ -26,7 +26,6 @@ class SpacecraftExpert(Expert):
     algorithm = "centralised planner of one agent, tracked with u*"
 
     def __init__(self, env: Any) -> None:
-        """Build the policy."""
         self._env = env
         self._task = env.settings
         self._policy = CentralizedPolicy(

@@ -16,6 +16,7 @@ from lagros_benchmarks.report.canvas import (
     caption,
     check_figure_path,
     curve,
+    legend,
     log_ordinate,
     save,
     styles,
@@ -57,79 +58,72 @@ def draw(rows: Sequence[Row], path: str | Path) -> Path:
     """
     path = check_figure_path(path)
     if len({row["agents"] for row in rows}) > 1:
-        return _scale_figure(rows, path)
+        return _sweep_figure(rows, path, "agents")
     if len({(row["disturbance"], row["bound"]) for row in rows}) > 1:
-        return _bound_figure(rows, path)
+        return _sweep_figure(rows, path, "bound")
     return _policy_figure(rows, path)
 
 
-def _bound_figure(rows: Sequence[Row], path: Path) -> Path:
-    columns = _columns(rows, ("disturbance", "safety_filter"))
+def _sweep_figure(rows: Sequence[Row], path: Path, along: str) -> Path:
+    """Draw success above, and below it effort along the bounds or time along the agents."""
+    scale = along == "agents"
+    keys = ("disturbance", "bound", "safety_filter") if scale else ("disturbance", "safety_filter")
+    columns = _columns(rows, keys)
     figure, panels = canvas(max(_NARROWEST, 3.1 * len(columns) + 0.9), 5.0, 2, len(columns), "row")
+    marks = sorted({row[along] for row in rows})
     for index, (title, part) in enumerate(columns):
-        success, effort = panels[index], panels[index + len(columns)]
+        success, below = panels[index], panels[index + len(columns)]
         success.set_title(title, loc="left", fontsize=10)
-        for axes, measure in ((success, _SUCCESS), (effort, _EFFORT)):
-            _draw_lines(axes, part, "bound", measure)
-        effort.set(xlabel="disturbance bound d̄ [state units/s]")
-        effort.set_xticks(sorted({row["bound"] for row in rows}))
-    _finish_success(panels[0])
+        _draw_lines(success, part, along, _SUCCESS)
+        if scale:
+            _draw_times(below, part)
+            below.set(xscale="log", xlabel="agents in the world")
+            below.set_xticks(marks, [str(count) for count in marks])
+            below.minorticks_off()
+        else:
+            _draw_lines(below, part, along, _EFFORT)
+            below.set(xlabel="disturbance bound d̄ [state units/s]")
+            below.set_xticks(marks)
+    panels[0].set(ylim=(-4, 104), yticks=(0, 25, 50, 75, 100), ylabel=_SUCCESS.label)
+    first, below = rows[0], panels[len(columns)]
     efforts = [row["effort_mean"] for row in rows if row["effort_mean"]]
-    effort = panels[len(columns)]
-    if efforts and max(efforts) > _WIDE_RANGE * min(efforts):
-        log_ordinate(effort)
+    if scale or (efforts and max(efforts) > _WIDE_RANGE * min(efforts)):
+        log_ordinate(below)
     else:
-        effort.set_ylim(bottom=0.0)
-    effort.set_ylabel(_EFFORT.label)
-    first = rows[0]
-    caption(
-        figure,
-        f"{task_title(first)}, {first['episodes']} worlds per point; success per agent; bands: "
-        "95 % intervals over worlds" + figure_note(rows),
-    )
-    _legend(figure, panels[0])
+        below.set_ylim(bottom=0.0)
+    below.set_ylabel("time [ms], median" if scale else _EFFORT.label)
+    if scale:
+        text = (
+            f"{first['task']}, {first['preset']}, {first['episodes']} worlds per point; success "
+            "per agent; bands: 95 % intervals over worlds\ntime: filled, one agent's decision, or "
+            "one plan for all agents; open, per agent where one call decides for all"
+        )
+    else:
+        text = (
+            f"{task_title(first)}, {first['episodes']} worlds per point; success per agent; bands: "
+            "95 % intervals over worlds"
+        )
+    caption(figure, text + figure_note(rows))
+    legend(figure, panels[0])
     return save(figure, path)
 
 
-def _scale_figure(rows: Sequence[Row], path: Path) -> Path:
-    columns = _columns(rows, ("disturbance", "bound", "safety_filter"))
-    figure, panels = canvas(max(_NARROWEST, 3.1 * len(columns) + 0.9), 5.0, 2, len(columns), "row")
-    counts = sorted({row["agents"] for row in rows})
-    for index, (title, part) in enumerate(columns):
-        success, time = panels[index], panels[index + len(columns)]
-        success.set_title(title, loc="left", fontsize=10)
-        _draw_lines(success, part, "agents", _SUCCESS)
-        for own, style in _lines(part, "agents"):
-            places = curve([row["agents"] for row in own])
-            delay = [_first_known(row, "plan_time_median_s", "step_time_median_s") for row in own]
-            _draw_line(time, places, 1e3 * curve(delay), style)
-            if own[0]["plan_time_median_s"] is None:
-                batch = 1e3 * curve([row["step_time_batch_per_agent_s"] for row in own])
-                time.plot(
-                    places,
-                    batch,
-                    color=style.colour,
-                    linewidth=0.9,
-                    linestyle="dotted",
-                    marker=style.marker,
-                    markersize=4,
-                    markerfacecolor="white",
-                )
-        time.set(xscale="log", xlabel="agents in the world")
-        time.set_xticks(counts, [str(count) for count in counts])
-        time.minorticks_off()
-    _finish_success(panels[0])
-    log_ordinate(panels[len(columns)])
-    panels[len(columns)].set_ylabel("time [ms], median")
-    first = rows[0]
-    caption(
-        figure,
-        f"{first['task']}, {first['preset']}, {first['episodes']} worlds per point; success per "
-        "agent; bands: 95 % intervals over worlds\ntime: filled, one agent's decision, or one plan "
-        "for all agents; open, per agent where one call decides for all" + figure_note(rows),
-    )
-    _legend(figure, panels[0])
-    return save(figure, path)
+def _draw_times(axes: Axes, rows: Sequence[Row]) -> None:
+    for own, style in _lines(rows, "agents"):
+        places = curve([row["agents"] for row in own])
+        delay = [_first_known(row, "plan_time_median_s", "step_time_median_s") for row in own]
+        _draw_line(axes, places, 1e3 * curve(delay), style)
+        if own[0]["plan_time_median_s"] is None:
+            axes.plot(
+                places,
+                1e3 * curve([row["step_time_batch_per_agent_s"] for row in own]),
+                color=style.colour,
+                linewidth=0.9,
+                linestyle="dotted",
+                marker=style.marker,
+                markersize=4,
+                markerfacecolor="white",
+            )
 
 
 def _policy_figure(rows: Sequence[Row], path: Path) -> Path:
@@ -230,22 +224,6 @@ def _draw_line(
         markersize=5,
         linewidth=1.6,
         label=label,
-    )
-
-
-def _finish_success(axes: Axes) -> None:
-    axes.set(ylim=(-4, 104), yticks=(0, 25, 50, 75, 100), ylabel=_SUCCESS.label)
-
-
-def _legend(figure: Any, axes: Axes) -> None:
-    handles, names = axes.get_legend_handles_labels()
-    figure.legend(
-        handles,
-        names,
-        loc="outside upper left",
-        ncols=min(len(names), 4),
-        frameon=False,
-        handlelength=3.0,
     )
 
 

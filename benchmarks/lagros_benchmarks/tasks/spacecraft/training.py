@@ -75,7 +75,6 @@ class ShapedReward(VecEnvWrapper):
         goal_radius: float,
         agent_radius: float,
     ) -> None:
-        """Wrap the environment; see the class."""
         super().__init__(venv)
         self.layout, self.training, self.period = layout, training, period
         self.goal_radius, self.agent_radius = goal_radius, agent_radius
@@ -122,7 +121,6 @@ class GoalFrame(VecEnvWrapper):
     """
 
     def __init__(self, venv: VecEnv, layout: Layout, settings: SpacecraftSettings) -> None:
-        """Wrap the environment; see the class."""
         super().__init__(
             venv,
             observation_space=spaces.Box(-np.inf, np.inf, (FEATURES,), np.float32),
@@ -163,7 +161,6 @@ class SpacecraftLesson:
     """
 
     def __init__(self, training: SpacecraftTraining, parallel_env: bool = False) -> None:
-        """Build the worlds; see the class."""
         self.training = training
         settings = SpacecraftSettings(
             time_limit=training.time_limit,

@@ -283,7 +283,6 @@ class PlansOnce:
     """A joint planner that answers the same question only once."""
 
     def __init__(self, planner: Any) -> None:
-        """Remember nothing yet."""
         self._planner, self._known = planner, dict[bytes, Any]()
 
     def __getattr__(self, name: str) -> Any:
