@@ -89,15 +89,9 @@ def canvas(
     share: Literal["all", "row"] = "all",
     abscissa: bool = True,
 ) -> tuple[Figure, list[Axes]]:
-    """Return an empty figure and its panels, line by line.
+    """Return an empty figure of a size [inch] and its panels, line by line.
 
-    Args:
-        width: [inch].
-        height: [inch].
-        lines: Panels above each other.
-        columns: Panels beside each other.
-        share: Which panels share their ordinate, as Matplotlib's `sharey`.
-        abscissa: Whether all panels share their abscissa.
+    They share their ordinate as Matplotlib's `sharey` says, and, if asked for, their abscissa.
     """
     # No pyplot: it keeps global state and picks a window system.
     from matplotlib.backends.backend_agg import FigureCanvasAgg

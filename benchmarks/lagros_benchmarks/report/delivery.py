@@ -85,11 +85,6 @@ class Outputs:
         check_outputs(self._paths, inputs, folders, kept)
 
     @property
-    def some(self) -> bool:
-        """Whether a file is asked for."""
-        return any(path is not None for path in self._paths.values())
-
-    @property
     def _paths(self) -> dict[str, Path | None]:
         return {
             "--json": self.json,
@@ -103,7 +98,7 @@ class Outputs:
 
     def write(self, run: BenchmarkRun, rows: list[Row]) -> Delivery:
         """Write the files, each on its own, and return what came of it."""
-        from lagros_benchmarks.report import records, tables
+        from lagros_benchmarks.report import figures, records, tables
         from lagros_benchmarks.run import files
 
         delivery = Delivery()
@@ -114,15 +109,9 @@ class Outputs:
         delivery.write_text(
             self.episodes, lambda: files.json_lines_text(records.episode_objects(run))
         )
-        delivery.write(self.figure, lambda path: _draw(rows, path))
+        delivery.write(self.figure, lambda path: figures.draw(rows, path))
         delivery.write(self.scene, lambda path: _draw_scene(run, self.scene_world, path))
         return delivery
-
-
-def _draw(rows: list[Row], path: Path) -> None:
-    from lagros_benchmarks.report.figures import draw
-
-    draw(rows, path)
 
 
 def _draw_scene(run: BenchmarkRun, world: int, path: Path) -> None:

@@ -13,14 +13,6 @@ __all__ = ["check_figure_path", "draw"]
 
 
 def draw(rows: Sequence[Row], path: str | Path) -> Path:
-    """Draw what is apt for the task and the conditions of some rows.
-
-    Args:
-        rows: Rows of any conditions of one task.
-        path: The figure, .png, .pdf or .svg.
-
-    Returns:
-        The path.
-    """
+    """Draw what is apt for the task and the conditions of some rows of one task."""
     drawn: Path = room_named(rows[0]["task"]).part("figures")(rows, path)
     return drawn

@@ -72,7 +72,6 @@ class WatchSettings:
     seconds: float | None = None
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         presets, most = self.described.presets, self.described.most_agents
         check_policy(self.policy, self.task)
@@ -123,9 +122,6 @@ class Playback:
 
     What the policy raises ends the episode as a failure; what was flown until then is shown.
 
-    Args:
-        settings: What to watch.
-
     Raises:
         ValueError: The policy's name is unknown, or the scenario is not valid or does not fit.
         OSError: The scenario cannot be read, or the policy has no weights.
@@ -134,7 +130,6 @@ class Playback:
     """
 
     def __init__(self, settings: WatchSettings) -> None:
-        """Build environment and policy."""
         import_pygame()
         self.settings = settings
         self.frames = 0

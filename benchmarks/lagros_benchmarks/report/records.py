@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from lagros_benchmarks.run.experiment import BenchmarkRun, Row
-from lagros_benchmarks.run.room import Room, room_of
+from lagros_benchmarks.run.room import room_of
 from lagros_benchmarks.run.settings import Case
 from lagros_benchmarks.run.surroundings import machine, own_command, threads, versions
 
@@ -18,15 +18,9 @@ def summarise(run: BenchmarkRun, command: Sequence[str] | None = None) -> list[R
     """Return one row per policy and condition: the public figures of a run.
 
     Efforts are averaged over the episodes that did not raise: one that raised has no effort, and
-    counting none would flatter the policy. It still counts as a failure in every rate.
-
-    Args:
-        run: The episodes.
-        command: What made the run; the command line of this process if None.
-
-    Returns:
-        The rows, in the order of the conditions and then of the policies.
-
+    counting none would flatter the policy. It still counts as a failure in every rate. The rows are
+    in the order of the conditions and then of the policies. They hold the command that is given, or
+    that of this process.
     """
     surroundings = {
         "machine": machine(),
@@ -38,7 +32,7 @@ def summarise(run: BenchmarkRun, command: Sequence[str] | None = None) -> list[R
         },
         "command": shlex.join(command if command is not None else own_command()),
     }
-    own = _room(run).part("records")
+    own = room_of(run.settings.description).part("records")
     return [
         {
             **_identity(run, case),
@@ -54,12 +48,9 @@ def summarise(run: BenchmarkRun, command: Sequence[str] | None = None) -> list[R
 
 def episode_objects(run: BenchmarkRun) -> Iterable[dict[str, Any]]:
     """Return every episode, or every agent of every world, as a JSON object."""
-    found: Iterable[dict[str, Any]] = _room(run).part("records").episode_objects(run)
+    own = room_of(run.settings.description).part("records")
+    found: Iterable[dict[str, Any]] = own.episode_objects(run)
     return found
-
-
-def _room(run: BenchmarkRun) -> Room:
-    return room_of(run.settings.description)
 
 
 def _identity(run: BenchmarkRun, case: Case) -> Row:

@@ -30,15 +30,7 @@ _LONGEST_LEGEND = 7  # policies that an empty panel has room for
 
 
 def draw(rows: Sequence[Row], path: str | Path) -> Path:
-    """Draw the error over time of one condition, or success against the bound of several.
-
-    Args:
-        rows: Rows of any conditions.
-        path: The figure, .png, .pdf or .svg.
-
-    Returns:
-        The path.
-    """
+    """Draw the error over time of one condition, or success against the bound of several."""
     return (error_figure if len(by_condition(rows)) == 1 else grid_figure)(rows, path)
 
 
@@ -47,13 +39,6 @@ def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
 
     The bands hold 80 % of the episodes. The axis is logarithmic where a mean leaves the paper's
     tube far behind.
-
-    Args:
-        rows: Rows of one condition.
-        path: The figure, .png, .pdf or .svg.
-
-    Returns:
-        The path.
 
     Raises:
         ValueError: The rows are of several conditions, or none has a tracking error.
@@ -102,15 +87,7 @@ def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
 
 
 def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
-    """Draw the success rate of each policy against the bound, one panel per kind.
-
-    Args:
-        rows: Rows of any conditions.
-        path: The figure, .png, .pdf or .svg.
-
-    Returns:
-        The path.
-    """
+    """Draw the success rate of each policy against the bound, one panel per kind."""
     path = check_figure_path(path)
     kinds = list(dict.fromkeys(row["disturbance"] for row in rows))
     policies = list(dict.fromkeys(row["policy"] for row in rows))

@@ -93,11 +93,7 @@ def ordered(group: Sequence[Row]) -> Sequence[Row]:
 
 
 def comparison_lines(group: Sequence[Row]) -> Iterator[str]:
-    """Yield a line per policy: its paired difference from the planner (b), or from the first.
-
-    Args:
-        group: Rows of one condition.
-    """
+    """Yield a line per policy: its paired difference from the planner (b), or from the first."""
     names = [row["policy"] for row in group]
     if len(names) < 2:
         return

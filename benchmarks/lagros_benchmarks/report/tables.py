@@ -57,11 +57,7 @@ def terminal_table(group: Sequence[Row]) -> Table:
 
 
 def comparison_lines(group: Sequence[Row]) -> Iterator[str]:
-    """Yield how the policies of one condition differ on the same episodes.
-
-    Args:
-        group: Rows of one condition.
-    """
+    """Yield how the policies of one condition differ on the same episodes."""
     return texts(group[0]).comparison_lines(group)
 
 

@@ -60,18 +60,10 @@ def video_bytes(kind: str, frames: Iterable[Frame], rate: float) -> bytes:
 
 
 def gif_bytes(frames: Iterable[Frame], rate: float) -> bytes:
-    """Return the frames as a GIF that repeats, with one palette for all of them.
+    """Return the frames as a GIF that repeats, with one palette for all of them; see `video_bytes`.
 
     One palette without dithering leaves what does not move unchanged from frame to frame, and what
     is unchanged is left out.
-
-    Args:
-        frames: As in `video_bytes`.
-        rate: Frames per second.
-
-    Raises:
-        ValueError: There is no frame.
-        ImportError: pillow is not installed.
     """
     image = _import_pillow()
     # Drawings compress a hundredfold, so that a long episode fits into memory.
@@ -108,14 +100,7 @@ def gif_bytes(frames: Iterable[Frame], rate: float) -> bytes:
 
 
 def common_colours(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the palette of a drawing, commonest colours first.
-
-    Args:
-        pixels: Shape (..., 3).
-
-    Returns:
-        Shape (k, 3) with k at most 64.
-    """
+    """Return the palette of pixels (..., 3), commonest colours first, shape (at most 64, 3)."""
     red, green, blue = np.moveaxis(pixels.reshape(-1, 3).astype(np.int64), -1, 0)
     codes, counts = np.unique((red << 16) | (green << 8) | blue, return_counts=True)
     codes = codes[np.argsort(-counts, kind="stable")]

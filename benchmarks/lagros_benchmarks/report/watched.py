@@ -94,13 +94,9 @@ class SingleGame:
 
 
 def efforts(what: str, to_success: float, to_end: float, unit: str) -> str:
-    """Return the effort as tables have it, and to the end of the episode where that is more.
+    """Return an effort as tables have it, and to the end of the episode where that is more.
 
-    Args:
-        what: What to call it.
-        to_success: To the first success, if there was one.
-        to_end: To the end of the episode.
-        unit: Of the control, squared; "" for none.
+    The unit is that of the control, squared; "" for none.
     """
     squared = f" {unit}s" if unit else ""
     if to_end == to_success:
@@ -115,13 +111,9 @@ class SinglePictures:
         env: The environment, unwrapped; somebody else resets it and takes its steps.
         render_mode: "human" opens a window; "rgb_array" draws without one.
         rate: Frames per second at which a window plays.
-
-    Raises:
-        ImportError: pygame is not installed.
     """
 
     def __init__(self, env: Any, render_mode: str, rate: float) -> None:
-        """Open the window, or what draws without one."""
         self._env = env
         self._renderer = env.settings.renderer(render_mode, max(1, round(rate)))
         self._begun: FloatArray = env.state
@@ -133,14 +125,9 @@ class SinglePictures:
         self._control = self._env.settings.control(np.asarray(action, np.float64))
 
     def draw(self, part: float, disturbance: FloatArray) -> Frame | None:
-        """Draw where a part of the last control step has led.
+        """Draw where a part of the last control step, in (0, 1], has led, under d of shape (n,).
 
-        Args:
-            part: Of the step, in (0, 1]; 1 is its end.
-            disturbance: d that was held in it, shape (n,).
-
-        Returns:
-            The frame, or None in a window.
+        Returns the frame, or None in a window.
         """
         env, task = self._env, self._env.settings
         steps = env.time / task.control_period - (1.0 - part)

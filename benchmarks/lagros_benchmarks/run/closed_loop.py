@@ -49,25 +49,24 @@ class ClosedLoop:
         step_times: Time of every decision [s].
     """
 
-    step: int
-    observation: Any
-    action: Any
-    memory: Any
-    reward: Any
-    terminated: Any
-    truncated: Any
-    ended: Any
-    over: bool
-    info: dict[str, Any]
-    step_times: list[float]
-
     def __init__(self, env: Any, policy: Any, past_the_end: bool = False) -> None:
-        """Nothing flies yet."""
         self.env, self.policy = env, as_policy(policy)
         self._past_the_end, self._batch = past_the_end, False
         self._seed: Any = None
         self._shapes: Sequence[tuple[int, ...]] = ()
         self._clear()
+
+    def _clear(self) -> None:
+        self.step, self.over = 0, False
+        self.observation: Any = None
+        self.action: Any = None
+        self.memory: Any = None
+        self.reward: Any = 0.0
+        self.terminated: Any = False
+        self.truncated: Any = False
+        self.ended: Any = False
+        self.info: dict[str, Any] = {}
+        self.step_times: list[float] = []
 
     def fly(self, seed: Any, options: dict[str, Any] | None = None) -> Iterator[ClosedLoop]:
         """Fly an episode, or a batch of them, to the end; yield at every control instant.
@@ -137,12 +136,8 @@ class ClosedLoop:
         """Ask the policy once before it flies, so that one that cannot run ends the command.
 
         Its first call also loads what the timed ones need. Whatever else it raises here it will
-        raise in its episodes, where it is written down.
-
-        Args:
-            what: What to call it in a message, "policy 'mine:Lean'" for instance.
-            seed: As for `fly`.
-            options: As for `fly`.
+        raise in its episodes, where it is written down. A message begins with `what`, "policy
+        'mine:Lean'" for instance.
 
         Raises:
             SetupError: A package is missing, or it answers by something that is no action of this
@@ -169,9 +164,3 @@ class ClosedLoop:
     def shapes(self) -> Sequence[tuple[int, ...]]:
         """Return the shapes that its action may have; it is taken in the first."""
         return (self.env.action_space.shape,)
-
-    def _clear(self) -> None:
-        self.step, self.reward = 0, 0.0
-        self.observation = self.action = self.memory = None
-        self.terminated = self.truncated = self.ended = self.over = False
-        self.info, self.step_times = {}, []

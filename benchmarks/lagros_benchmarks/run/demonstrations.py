@@ -57,7 +57,6 @@ class DemonstrationSettings:
     bound: float | None = None
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_fields(self)
         find_task(self.task)
         check_whole("episodes", self.episodes, 1, MOST_EPISODES)
@@ -152,16 +151,7 @@ def make_expert(settings: DemonstrationSettings, env: Environment) -> Expert:
 
 
 def fly(env: Environment, expert: Expert, seed: int) -> Demonstration:
-    """Fly one episode to its end, whatever the end is.
-
-    Args:
-        env: The environment, see `DemonstrationSettings.make_env`.
-        expert: The expert.
-        seed: Seed of the episode.
-
-    Returns:
-        What happened.
-    """
+    """Fly one episode of the expert to its end, whatever the end is."""
     loop = ClosedLoop(env, expert)
     observations: list[Float32Array] = []
     infos: list[dict[str, Any]] = []
@@ -193,11 +183,7 @@ def fly(env: Environment, expert: Expert, seed: int) -> Demonstration:
 def demonstrate(
     settings: DemonstrationSettings, on_episode: Callable[[int], None] | None = None
 ) -> tuple[list[Demonstration], dict[str, Any]]:
-    """Fly all episodes of a run.
-
-    Args:
-        settings: What to fly.
-        on_episode: Called with the number of episodes that are finished.
+    """Fly all episodes of a run; `on_episode` is called with the number of those that are finished.
 
     Returns:
         The episodes in the order of their seeds, none left out, and the record of what they depend
@@ -223,16 +209,11 @@ def demonstrate(
 
 
 class SingleExpert(Expert):
-    """One plan of the whole episode, tracked with u*.
-
-    Args:
-        env: The environment, unwrapped.
-    """
+    """One plan of the whole episode, tracked with u*."""
 
     algorithm = "CV-STEM tube MPC: one plan, tracked with u*"
 
     def __init__(self, env: Any) -> None:
-        """Build the policy."""
         from lagros_policies.tube_mpc import TubeMpcPolicy
 
         self._task = env.settings

@@ -92,20 +92,11 @@ def run_episode(
     *,
     label: str | None = None,
 ) -> EpisodeRecord:
-    """Run one episode to its end.
+    """Run one episode in an environment of one body to its end.
 
     An exception in the policy or the environment ends the episode as a failure that is written
-    down with its text; it is never raised and the episode is never dropped.
-
-    Args:
-        env: An environment of one body.
-        policy: The policy, or an object with its `predict`.
-        seed: Seed of the episode.
-        nominal: x_d at every control instant, or None if there is no plan.
-        label: What to call the policy; its own name if None.
-
-    Returns:
-        The record of the episode.
+    down with its text; it is never raised and the episode is never dropped. The plan is x_d
+    at every control instant, shape (steps + 1, n), or None where there is none.
     """
     loop = ClosedLoop(env, policy)
     errors: list[float] = []

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from lagros_benchmarks.run.keeping import Kept
 from lagros_benchmarks.run.settings import BenchmarkSettings, Case
-from lagros_benchmarks.run.workers import Keeper, Progress
+from lagros_benchmarks.run.workers import Progress
 
 __all__ = ["BenchmarkRun", "Experiment", "Progress", "Row"]
 
@@ -44,7 +45,7 @@ class Experiment(Protocol):
         """Whether the step times need a serial pass of their own."""
         ...
 
-    def units(self, progress: Progress | None, keeper: Keeper | None = None) -> list[Any]:
+    def units(self, progress: Progress | None, keeper: Kept | None = None) -> list[Any]:
         """Return one unit per episode, the same for every case; see `gather` for the keeper."""
         ...
 
@@ -62,11 +63,5 @@ class Experiment(Protocol):
         outcomes: Mapping[Case, Sequence[Any]],
         timing: Mapping[Case, Any] | None,
     ) -> BenchmarkRun:
-        """Put the run together.
-
-        Args:
-            units: One per episode.
-            outcomes: Those of each case's chunks, in the order of the episodes.
-            timing: What `time` returned for each case; None if it was not asked.
-        """
+        """Put the run together; `timing` is what `time` returned of each case, if asked."""
         ...

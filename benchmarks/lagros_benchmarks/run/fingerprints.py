@@ -36,10 +36,6 @@ def fingerprint(settings: BenchmarkSettings, toolbox: Toolbox) -> str:
     These are the settings, the content of the files and modules that they name, our own code and
     weights, the versions of what is installed, the threads and the processor: the last digit of a
     product may depend on each.
-
-    Args:
-        settings: Those of the run.
-        toolbox: Where its policies and plans come from.
     """
     record = {name: value for name, value in asdict(settings).items() if name not in _FREE}
     made_by = machine()

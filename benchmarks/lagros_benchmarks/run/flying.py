@@ -55,13 +55,11 @@ class Attempt:
     """
 
     def __init__(self, *passing: type[BaseException]) -> None:
-        """Begin without an error."""
         self.error: str | None = None
         self._passing: tuple[type[BaseException], ...] = (KeyboardInterrupt, *passing)
         self._process: ProcessState | None = None
 
     def __enter__(self) -> Attempt:
-        """Begin."""
         self._process = ProcessState()
         return self
 
@@ -154,8 +152,7 @@ def _said(answer: Any) -> str:
 def raised_line(raised: Iterable[tuple[str, int, int]]) -> str:
     """Return what a command says at its end of the episodes that raised; "" if none did.
 
-    Args:
-        raised: Name of the policy, number of episodes that raised and number of all, of each row.
+    Of each row are given the policy, how many episodes raised, and how many there were.
     """
     counts: dict[str, list[int]] = {}
     for name, count, total in raised:

@@ -29,7 +29,6 @@ class Keepable:
     """A dataclass that chunks are made of; whoever derives from it is read back by its name."""
 
     def __init_subclass__(cls) -> None:
-        """Know the class."""
         super().__init_subclass__()
         _KEEPABLE[cls.__name__] = cls
 
@@ -44,7 +43,6 @@ class Kept:
     """
 
     def __init__(self, folder: Path, key: str) -> None:
-        """Nothing is read or written yet."""
         self.folder = folder
         self.key = key
         # A policy may change the working folder.
@@ -52,16 +50,10 @@ class Kept:
         self._failed = False
 
     def __len__(self) -> int:
-        """Return the number of files."""
         return sum(1 for _ in self._place.glob("*.json"))
 
     def found(self, title: str, count: int) -> dict[int, Any]:
-        """Return the chunks of one stage that are there and whole, by index.
-
-        Args:
-            title: Name of the stage.
-            count: How many chunks it has.
-        """
+        """Return the chunks of one stage that are there and whole, by index below `count`."""
         chunks = {}
         for index in range(count):
             # A list, because an outcome may be None.

@@ -46,12 +46,7 @@ class SetupError(Exception):
 
     @classmethod
     def building(cls, what: str, error: BaseException) -> SetupError:
-        """Return the error of something that cannot be built; its name is said once.
-
-        Args:
-            what: What was built, "policy 'mine:Lean'" for instance.
-            error: What that has raised.
-        """
+        """Return the error of what cannot be built, "policy 'mine:Lean'" for instance."""
         text = describe_error(error)
         own = text.partition(": ")[2] if isinstance(error, ValueError) else ""
         return cls(own if own.startswith(what) else f"{what} cannot be built: {text}")
@@ -61,11 +56,8 @@ class SetupError(Exception):
 def building(what: str) -> Iterator[None]:
     """Turn whatever the constructor of a stranger raises, SystemExit too, into a `SetupError`.
 
-    Args:
-        what: As for `SetupError.building`.
-
     Raises:
-        SetupError: Something was raised.
+        SetupError: Something was raised; its message begins with `what`.
     """
     try:
         with undone():  # where a constructor goes, it goes for itself
@@ -84,11 +76,7 @@ def make_policy(name: str, env: Any, settings: Mapping[str, Any]) -> Any:
 
 
 def built_policy(name: str, make: Callable[[], Any]) -> BasePolicy:
-    """Build a policy, of which then everything can be asked.
-
-    Args:
-        name: The policy, as the run was asked for it.
-        make: Builds it.
+    """Build a policy by its name in the run, of which then everything can be asked.
 
     Raises:
         SetupError: It cannot be built, or is no policy.
@@ -157,22 +145,13 @@ class Toolbox:
     position_margin: Callable[[BasePolicy, float], float | None] | None = None
 
     def with_policies(self, policies: Mapping[str, Any]) -> Toolbox:
-        """Return the same with some policies that are objects, by name.
-
-        Args:
-            policies: Each is copied wherever one is built by its name.
-        """
+        """Return the same with some policies that are objects, each copied wherever it is built."""
         return replace(self, make_policy=GivenPolicies(policies, self.make_policy))
 
 
 @dataclass(frozen=True)
 class GivenPolicies:
-    """Makes a policy: a copy of an object that was given, or what its name says.
-
-    Attributes:
-        objects: The policies, by name.
-        otherwise: Makes all others.
-    """
+    """Makes a policy: a copy of one of some objects, or what its name says otherwise."""
 
     objects: Mapping[str, Any]
     otherwise: Callable[[str, Any, Mapping[str, Any]], Any]

@@ -22,7 +22,6 @@ class ProcessState:
     """
 
     def __init__(self) -> None:
-        """Take down what is there."""
         try:
             self._folder: str | None = os.getcwd()
         except OSError:  # it has been removed

@@ -146,11 +146,7 @@ class ReproduceSettings:
         _Making(self, folder, progress, say).run()
 
     def benchmark(self, folder: Path | None) -> BenchmarkSettings:
-        """Return the benchmark of (a), (b), (c) and LQR.
-
-        Args:
-            folder: Where metric and weights lie; None takes the shipped ones.
-        """
+        """Return the benchmark of (a), (b), (c) and LQR, of a folder's files or those shipped."""
         made: dict[str, Any] = {}
         if folder is not None:
             metric = str(folder / "metric.json")

@@ -44,12 +44,7 @@ class Reproduction(Protocol):
 
 
 def made_before(read: Callable[[], Made], say: Say) -> Made | None:
-    """Return what a stage has left behind; None if it is not there, or damaged, which is said.
-
-    Args:
-        read: Reads the stage's file.
-        say: Takes a line.
-    """
+    """Return what a stage has left behind; None if it is not there, or damaged, which is said."""
     try:
         return read()
     except FileNotFoundError:
@@ -65,16 +60,10 @@ def reproduce(
     progress: Progress | None = None,
     say: Say | None = None,
 ) -> BenchmarkSettings:
-    """Make all that the policies of a task need; a run that was interrupted goes on.
+    """Make all that the policies of a task need in a folder; a run that was interrupted goes on.
 
-    Args:
-        folder: Where everything is kept.
-        settings: What to make.
-        progress: Called with a title, the units done and the units in all.
-        say: Called with a line after each stage.
-
-    Returns:
-        The benchmark of what was made, ready to run.
+    `progress` is called with a title, the units done and the units in all, `say` with a line after
+    each stage. The benchmark of what was made is returned, ready to run.
 
     Raises:
         ValueError: The folder holds a run of other settings.

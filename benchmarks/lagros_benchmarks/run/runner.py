@@ -47,14 +47,9 @@ def make_experiment(settings: BenchmarkSettings, toolbox: Toolbox | None = None)
 def kept_in(
     folder: Path | str, settings: BenchmarkSettings, toolbox: Toolbox | None = None
 ) -> Kept:
-    """Return the finished chunks of a run of these settings, in a folder of its own.
+    """Return the finished chunks of a run of these settings, in a folder of its own below this one.
 
     Runs of other settings, policies, weights or versions have others, so that all may share one.
-
-    Args:
-        folder: Holds the folders of runs; need not be there.
-        settings: Those of the run.
-        toolbox: As for `run_benchmark`.
 
     Raises:
         ValueError: The settings are none.
@@ -114,13 +109,26 @@ def run_benchmark(
     if kept is not None and kept.key != fingerprint(settings, toolbox or Toolbox()):
         raise ValueError("kept is of other settings; use kept_in(folder, settings, toolbox)")
     experiment = make_experiment(settings, toolbox)
-    cases = settings.cases
-    with running(settings.backend, settings.jobs):
+    cases, jobs, backend = settings.cases, settings.jobs, settings.backend
+    with running(backend, jobs):
         units = experiment.units(progress, kept)
-        outcomes = _play_cases(experiment, settings, cases, units, progress, kept)
+        chunks = [(case, part) for case in cases for part in split(units, settings.chunk)]
+
+        def work(chunk: tuple[Case, Sequence[Any]]) -> Any:
+            return experiment.play(*chunk)
+
+        played = gather("episodes", work, chunks, jobs, progress, backend, kept)
+    outcomes: dict[Case, list[Any]] = {case: [] for case in cases}
+    for (case, _), outcome in zip(chunks, played, strict=True):
+        outcomes[case].append(outcome)
     timing = None
     if experiment.timed_apart:
-        timing = _time_cases(experiment, settings, cases, units, progress, kept)
+        # The first episodes again, in this process alone.
+        first = units[: settings.timing_episodes]
+        timed = gather(
+            "timing", lambda case: experiment.time(case, first), cases, 1, progress, keeper=kept
+        )
+        timing = dict(zip(cases, timed, strict=True))
     return experiment.finish(units, outcomes, timing)
 
 
@@ -130,13 +138,7 @@ def fly_scene(
     toolbox: Toolbox | None = None,
     policies: Mapping[str, Any] | None = None,
 ) -> Any:
-    """Fly one world of a benchmark of many agents again and keep where everybody was.
-
-    Args:
-        settings: Those of the run.
-        world: Which of its worlds, from 0.
-        toolbox: As for `run_benchmark`.
-        policies: As for `run_benchmark`.
+    """Fly one world of a benchmark of many agents again, from 0, and keep where everybody was.
 
     Raises:
         ValueError: The run has no such world.
@@ -166,39 +168,3 @@ def _with_policies(
             raise ValueError(f"policies: {name!r} is a policy of this package; take another name")
     names = dict.fromkeys((*settings.policies, *policies))
     return replace(settings, policies=tuple(names)), (toolbox or Toolbox()).with_policies(policies)
-
-
-def _play_cases(
-    experiment: Experiment,
-    settings: BenchmarkSettings,
-    cases: Sequence[Case],
-    units: Sequence[Any],
-    progress: Progress | None,
-    kept: Kept | None,
-) -> dict[Case, list[Any]]:
-    chunks = [(case, part) for case in cases for part in split(units, settings.chunk)]
-
-    def work(chunk: tuple[Case, Sequence[Any]]) -> Any:
-        return experiment.play(*chunk)
-
-    outcomes: dict[Case, list[Any]] = {case: [] for case in cases}
-    played = gather("episodes", work, chunks, settings.jobs, progress, settings.backend, kept)
-    for (case, _), outcome in zip(chunks, played, strict=True):
-        outcomes[case].append(outcome)
-    return outcomes
-
-
-def _time_cases(
-    experiment: Experiment,
-    settings: BenchmarkSettings,
-    cases: Sequence[Case],
-    units: Sequence[Any],
-    progress: Progress | None,
-    kept: Kept | None,
-) -> dict[Case, Any]:
-    """Run the first episodes again, in this process alone."""
-    first = units[: settings.timing_episodes]
-    timed = gather(
-        "timing", lambda case: experiment.time(case, first), cases, 1, progress, keeper=kept
-    )
-    return dict(zip(cases, timed, strict=True))

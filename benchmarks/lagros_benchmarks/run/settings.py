@@ -70,11 +70,7 @@ def unknown_name(what: str, given: object, valid: Iterable[str], note: str = "")
 
 
 def check_policy(name: str, task: str | None = None) -> None:
-    """Check that a policy is a known name, an existing file or an importable module.
-
-    Args:
-        name: The policy.
-        task: The task whose names count; the first if left out.
+    """Check that a policy is a name of a task's, the first's if left out, a file or a module:Class.
 
     Raises:
         ValueError: It is neither.
@@ -105,12 +101,8 @@ def check_policy(name: str, task: str | None = None) -> None:
 def check_fits(task: Described, **given: Any) -> None:
     """Check that what is asked of a run of many agents is not asked of one body.
 
-    Args:
-        task: The task.
-        given: Settings by name; None, False or empty where they are left out.
-
     Raises:
-        ValueError: One is given, and the task has one body.
+        ValueError: A setting is neither None, False, empty nor "none", and the task has one body.
     """
     if task.most_agents > 1:
         return
@@ -168,7 +160,6 @@ class BenchmarkSettings:
     backend: Backend = LOKY
 
     def __post_init__(self) -> None:
-        """Check the settings."""
         check_fields(self)
         task = self.description
         for name in ("policies", "disturbances", "bounds", "agents"):
@@ -235,10 +226,6 @@ class BenchmarkSettings:
     @classmethod
     def for_task(cls, task: str, **given: Any) -> BenchmarkSettings:
         """Return the settings of a task, with its own defaults for what is None.
-
-        Args:
-            task: Name of the task.
-            given: Settings; None takes the task's default.
 
         Raises:
             ValueError: A setting is not valid.

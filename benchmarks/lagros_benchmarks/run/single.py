@@ -12,7 +12,7 @@ import numpy as np
 from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.episodes import EpisodeRecord, run_episode
 from lagros_benchmarks.run.experiment import BenchmarkRun
-from lagros_benchmarks.run.keeping import Keepable
+from lagros_benchmarks.run.keeping import Keepable, Kept
 from lagros_benchmarks.run.library import (
     FloatArray,
     SetupError,
@@ -22,7 +22,7 @@ from lagros_benchmarks.run.library import (
     describe_error,
 )
 from lagros_benchmarks.run.settings import BenchmarkSettings, Case, Condition
-from lagros_benchmarks.run.workers import Keeper, Progress, gather, split
+from lagros_benchmarks.run.workers import Progress, gather, split
 from lagros_envs.env import TaskEnv
 from lagros_envs.task import Task
 from lagros_policies.policy import BasePolicy
@@ -105,17 +105,28 @@ class SingleExperiment:
         """Whether workers contend for the processor."""
         return self.settings.backend.in_parallel(self.settings.jobs)
 
-    def units(self, progress: Progress | None, keeper: Keeper | None = None) -> list[NominalPlan]:
-        """Return the nominal plan of every episode."""
-        return plan_nominals(self, progress, keeper)
+    def units(self, progress: Progress | None, keeper: Kept | None = None) -> list[NominalPlan]:
+        """Return the nominal plan of every episode, which depends on the scenario alone."""
+        settings = self.settings
+        chunks = list(split(settings.episode_seeds(), settings.chunk))
+
+        def work(seeds: Sequence[int]) -> list[NominalPlan]:
+            return _plan_chunk(self, seeds)
+
+        jobs, backend = settings.jobs, settings.backend
+        planned = gather("planning", work, chunks, jobs, progress, backend, keeper)
+        return [plan for part in planned for plan in part]
 
     def play(self, case: Case, units: Sequence[NominalPlan]) -> list[EpisodeRecord]:
         """Run episodes one after the other and return their records."""
-        return self._episodes(case, units)
+        env = self.environment(case.condition)
+        policy = self.policy(case.policy, env)
+        return [
+            run_episode(env, policy, plan.seed, plan.states, label=case.policy) for plan in units
+        ]
 
-    def time(self, case: Case, units: Sequence[NominalPlan]) -> list[EpisodeRecord]:
-        """Run episodes for their step times."""
-        return self._episodes(case, units)
+    # For the step times of the same records.
+    time = play
 
     def finish(
         self,
@@ -160,27 +171,6 @@ class SingleExperiment:
         still = np.zeros((self.task.steps + 1, self.task.system.state_dim))
         ClosedLoop(env, policy).rehearse(f"policy {name!r}", options={"nominal": still})
         return policy
-
-    def _episodes(self, case: Case, units: Sequence[NominalPlan]) -> list[EpisodeRecord]:
-        env = self.environment(case.condition)
-        policy = self.policy(case.policy, env)
-        return [
-            run_episode(env, policy, plan.seed, plan.states, label=case.policy) for plan in units
-        ]
-
-
-def plan_nominals(
-    experiment: SingleExperiment, progress: Progress | None = None, keeper: Keeper | None = None
-) -> list[NominalPlan]:
-    """Plan x_d of every episode once: it depends on the scenario alone."""
-    settings = experiment.settings
-    chunks = list(split(settings.episode_seeds(), settings.chunk))
-
-    def work(seeds: Sequence[int]) -> list[NominalPlan]:
-        return _plan_chunk(experiment, seeds)
-
-    planned = gather("planning", work, chunks, settings.jobs, progress, settings.backend, keeper)
-    return [plan for part in planned for plan in part]
 
 
 def forward_time(policy: BasePolicy) -> float | None:

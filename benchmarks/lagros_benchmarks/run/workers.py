@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import TypeVar
 
+from lagros_benchmarks.run.keeping import Kept
 from lagros_policies.backends import LOKY, Backend, each
 
 # (what is being done, units done, units in all).
 Progress = Callable[[str, int, int], None]
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
-
-
-class Keeper(Protocol):
-    """Where finished work is kept, so that a run that was killed goes on; see `keeping.Kept`."""
-
-    def found(self, title: str, count: int) -> dict[int, Any]:
-        """Return what is there of so many items, by index."""
-        ...
-
-    def add(self, title: str, index: int, outcome: Any) -> None:
-        """Keep the result of an item."""
-        ...
 
 
 def gather(
@@ -32,18 +21,13 @@ def gather(
     jobs: int,
     progress: Progress | None,
     backend: Backend = LOKY,
-    keeper: Keeper | None = None,
+    keeper: Kept | None = None,
 ) -> list[Outcome]:
     """Return the results of the work, in the order of the items, whatever the jobs.
 
-    Args:
-        title: What is being done, for the progress.
-        work: Called with each item; what it closes over travels to the workers.
-        items: The items.
-        jobs: Worker processes; 1 works in this one.
-        progress: Called after every item.
-        backend: Whose processes they are.
-        keeper: Has what an earlier run has finished, and takes what this one finishes.
+    `progress` is called with the title after every item. What `work` closes over travels to the
+    workers; one job works in this process. The keeper has what an earlier run has finished, and
+    takes what this one finishes.
 
     Raises:
         BackendError: The backend is not installed, not reachable, or loses its workers.

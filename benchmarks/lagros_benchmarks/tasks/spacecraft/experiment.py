@@ -10,9 +10,10 @@ import numpy as np
 
 from lagros_benchmarks.run.episodes import added_up
 from lagros_benchmarks.run.experiment import BenchmarkRun
+from lagros_benchmarks.run.keeping import Kept
 from lagros_benchmarks.run.library import FloatArray, Toolbox, building, built_policy
 from lagros_benchmarks.run.settings import BenchmarkSettings, Case
-from lagros_benchmarks.run.workers import Keeper, Progress
+from lagros_benchmarks.run.workers import Progress
 from lagros_benchmarks.tasks.spacecraft.claims import position_margin
 from lagros_benchmarks.tasks.spacecraft.episodes import (
     Flight,
@@ -138,7 +139,7 @@ class SpacecraftExperiment:
         with building(f"policy {name!r} with the safety filter"):
             return (self.toolbox.make_filter or make_filter)(policy, env, bound)
 
-    def units(self, progress: Progress | None, keeper: Keeper | None = None) -> list[int]:
+    def units(self, progress: Progress | None, keeper: Kept | None = None) -> list[int]:
         """Return the seed of every world: each policy plans for itself."""
         return self.settings.episode_seeds()
 
