@@ -14,7 +14,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import lagros_policies
 from lagros_benchmarks.worst_case.flights import (
@@ -28,12 +27,11 @@ from lagros_benchmarks.worst_case.flights import (
 )
 from lagros_benchmarks.worst_case.goals import profile
 from lagros_benchmarks.worst_case.seeds import CALIBRATION
+from lagros_envs.arrays import FloatArray
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.task import Task
 from lagros_policies.contraction.conformal import bound_statement, conformal_bound
 from lagros_policies.contraction.statement import Statement
-
-FloatArray = NDArray[np.float64]
 
 # Episodes that fly in one batch.
 _CHUNK = 500

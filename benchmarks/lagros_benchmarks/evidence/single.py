@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_benchmarks.evidence.calibration import single_statements
 from lagros_benchmarks.evidence.records import recorded
@@ -25,6 +24,7 @@ from lagros_benchmarks.worst_case.flights import (
     random_pushes,
 )
 from lagros_benchmarks.worst_case.seeds import CALIBRATION
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.dynamics import control_matrix
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.task import Task
@@ -35,9 +35,6 @@ from lagros_policies.contraction.statement import Statement, at_least, at_most
 from lagros_policies.contraction.theorems import contraction_distance, feasibility_residual
 from lagros_policies.proof.bounds import ProvedBounds
 from lagros_policies.proof.condition import prove
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Kinds of disturbance of the flights; the calibrated bounds are of the first.
 KINDS = ("uniform", "sphere", "gust")

@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_benchmarks.run.files import write_atomic
+from lagros_envs.arrays import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FloatArray = NDArray[np.float64]
 
 FORMATS = (".png", ".pdf", ".svg")
 BLACK = "#000000"  # of the tubes; no policy has it

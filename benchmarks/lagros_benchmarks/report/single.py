@@ -10,7 +10,6 @@ import numpy as np
 
 from lagros_benchmarks.run.episodes import TUBE_TOLERANCE, EpisodeRecord, added_up
 from lagros_benchmarks.run.experiment import Row
-from lagros_benchmarks.run.library import FloatArray
 from lagros_benchmarks.run.metrics import (
     carry_forward,
     effort_ratio,
@@ -21,6 +20,7 @@ from lagros_benchmarks.run.metrics import (
 )
 from lagros_benchmarks.run.settings import Case
 from lagros_benchmarks.run.single import SingleRun
+from lagros_envs.arrays import FloatArray
 from lagros_envs.task import Task
 
 _BAND = (10.0, 90.0)  # percentiles of the tracking error over the episodes

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 import lagros_envs  # noqa: F401  (registers the environments)
 from lagros_benchmarks.report.video import Frame
@@ -15,14 +14,13 @@ from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.library import make_single_policy
 from lagros_benchmarks.worst_case.flights import plan_of
+from lagros_envs.arrays import FloatArray
 from lagros_envs.draw import Frame as Scene
 from lagros_envs.dynamics import hold_step
 from lagros_policies.planning.planner import planner_of
 
 if TYPE_CHECKING:
     from lagros_benchmarks.report.playback import WatchSettings
-
-FloatArray = NDArray[np.float64]
 
 
 class SingleGame:

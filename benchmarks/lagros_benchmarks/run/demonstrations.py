@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.room import room_of
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.checks import check_disturbance_bound, check_fields, check_seed, check_whole
 from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.registry import find_task, first_task
@@ -26,9 +27,6 @@ from lagros_envs.seeding import episode_seeds
 from lagros_envs.task import Described
 from lagros_policies.policy import BasePolicy, PolicyState
 
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
-BoolArray = NDArray[np.bool_]
 Environment = gym.Env[Any, Any]
 
 MOST_EPISODES = 1_000_000  # all lie in memory

@@ -12,7 +12,8 @@ import numpy as np
 from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.keeping import Keepable
-from lagros_benchmarks.run.library import Environment, FloatArray
+from lagros_benchmarks.run.library import Environment
+from lagros_envs.arrays import FloatArray
 
 # Both tubes begin with radius zero, where a plan's rounding must not count as leaving them. The
 # planner promises its plans to the same accuracy.

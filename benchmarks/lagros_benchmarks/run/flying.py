@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from lagros_benchmarks.run.library import describe_error
 from lagros_benchmarks.run.process import ProcessState
+from lagros_envs.arrays import Float32Array
 from lagros_policies.policy import BasePolicy
-
-Float32Array = NDArray[np.float32]
 
 # Exit status of a command that has flown and written everything, where some episodes raised.
 RAISED = 3

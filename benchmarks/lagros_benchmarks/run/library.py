@@ -13,16 +13,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-import numpy as np
-from numpy.typing import NDArray
 
 from lagros_benchmarks.run.process import undone
+from lagros_envs.arrays import FloatArray
 from lagros_policies.policy import BasePolicy, as_policy
 
 if TYPE_CHECKING:
     from lagros_policies.planning.planner import Planner
 
-FloatArray = NDArray[np.float64]
 Environment = gym.Env[Any, Any]
 
 _LONGEST_TEXT = 500

@@ -12,9 +12,8 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from lagros_envs.arrays import FloatArray
 
 CONFIDENCE = 0.95
 RESAMPLES = 2000

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from lagros_benchmarks.run.experiment import Progress
 from lagros_benchmarks.run.reproduction import Say, made_before
 from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_envs.arrays import Float32Array, IntArray
 from lagros_envs.checks import check_fields
 from lagros_envs.dynamics.straight_line import statements, straight_line
 from lagros_envs.files import write_atomic
@@ -38,9 +39,6 @@ from lagros_policies.learning.networks import Mlp
 from lagros_policies.learning.shards import claim
 from lagros_policies.learning.train import TrainingSettings, fit, learning_error
 from lagros_policies.trained_for import training_of, weights_record
-
-Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.intp]
 
 _SHARDS = 20  # pieces of work, where they divide plans and samples
 # What metric, plans and networks ask of a task besides its settings, equation and scenarios.

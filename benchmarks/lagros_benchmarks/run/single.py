@@ -14,7 +14,6 @@ from lagros_benchmarks.run.episodes import EpisodeRecord, run_episode
 from lagros_benchmarks.run.experiment import BenchmarkRun
 from lagros_benchmarks.run.keeping import Keepable, Kept
 from lagros_benchmarks.run.library import (
-    FloatArray,
     SetupError,
     Toolbox,
     building,
@@ -23,6 +22,7 @@ from lagros_benchmarks.run.library import (
 )
 from lagros_benchmarks.run.settings import BenchmarkSettings, Case, Condition
 from lagros_benchmarks.run.workers import Progress, gather, split
+from lagros_envs.arrays import FloatArray
 from lagros_envs.env import TaskEnv
 from lagros_envs.task import Task
 from lagros_policies.policy import BasePolicy

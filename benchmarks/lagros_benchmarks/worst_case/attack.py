@@ -8,7 +8,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_benchmarks.run.metrics import wilson_interval
 from lagros_benchmarks.run.room import room_of
@@ -17,6 +16,7 @@ from lagros_benchmarks.worst_case.goals import GOALS
 from lagros_benchmarks.worst_case.replay import Outcome, WorstCases
 from lagros_benchmarks.worst_case.search import MOST, Found, SearchSettings
 from lagros_benchmarks.worst_case.seeds import ATTACK
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import (
     check_disturbance_bound,
     check_fields,
@@ -29,7 +29,6 @@ from lagros_envs.reading import Record
 from lagros_envs.registry import find_task, first_task
 from lagros_envs.seeding import episode_seeds
 
-FloatArray = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 # Kind of the random disturbance that the worst case is held against.

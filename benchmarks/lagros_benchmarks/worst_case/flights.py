@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lagros_benchmarks.run.flying import AnswerError, Attempt, ask
 from lagros_benchmarks.run.library import make_single_policy
+from lagros_envs.arrays import BoolArray, FloatArray, IntArray
 from lagros_envs.disturbances import Disturbance
 from lagros_envs.dynamics import hold_step
 from lagros_envs.numbers import functions
@@ -27,9 +28,6 @@ from lagros_policies.planning.planner import Planner, planner_of
 from lagros_policies.planning.trajectory import Trajectory
 from lagros_policies.room import shipped_file
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 # (states (b, n), episodes (b,), steps (b,)) -> controls (b, m).
 Law = Callable[[FloatArray, IntArray, IntArray], FloatArray]
 

@@ -4,15 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lagros_benchmarks.worst_case.flights import (
-    Episodes,
-    Flights,
-    FloatArray,
-    IntArray,
-    Law,
-    ahead,
-    parts_of,
-)
+from lagros_benchmarks.worst_case.flights import Episodes, Flights, Law, ahead, parts_of
+from lagros_envs.arrays import FloatArray, IntArray
 from lagros_envs.numbers import functions
 from lagros_envs.numbers.dual import gradients, seed
 

@@ -9,9 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from lagros_envs.arrays import FloatArray
 
 # Share of a population that the cross-entropy method learns from, and how slowly it learns.
 _ELITE = 0.2

@@ -15,13 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import is_number, shown
 from lagros_envs.files import write_atomic
 from lagros_envs.reading import Record, named, parse_json, read_npz
-
-FloatArray = NDArray[np.float64]
 
 _FORMAT = "lagros-worst-case-1"
 # Of all sequences together: a thousand worlds of eight agents have less.

@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lagros_envs.arrays import FloatArray
 from lagros_envs.disturbances import Situation, into_unit_ball, onto_unit_sphere
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,6 @@ from lagros_benchmarks.run.library import make_single_policy
 from lagros_benchmarks.worst_case.flights import (
     Episodes,
     Flights,
-    FloatArray,
-    IntArray,
     Law,
     Planning,
     ahead,
@@ -34,6 +32,7 @@ from lagros_benchmarks.worst_case.goals import gradient, scores, tracking_error
 from lagros_benchmarks.worst_case.replay import Outcome
 from lagros_benchmarks.worst_case.search import Found, search
 from lagros_benchmarks.worst_case.sequences import Replay
+from lagros_envs.arrays import FloatArray, IntArray
 from lagros_envs.disturbances import onto_unit_sphere
 from lagros_envs.registry import find_task
 from lagros_envs.task import LARGEST_DISTANCE, Task

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.library import building, make_single_policy
@@ -24,6 +23,7 @@ from lagros_benchmarks.worst_case.optimisers import make_search
 from lagros_benchmarks.worst_case.replay import Outcome
 from lagros_benchmarks.worst_case.search import Found, SearchSettings
 from lagros_benchmarks.worst_case.sequences import Replay
+from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_name, check_whole
 from lagros_envs.disturbances import Disturbance
 from lagros_envs.seeding import episode_streams
@@ -31,7 +31,6 @@ from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 
-FloatArray = NDArray[np.float64]
 # Position and velocity along the first axis of the arena, in the state of a spacecraft.
 _PLANE = [0, 3]
 

@@ -6,14 +6,12 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_benchmarks.run.demonstrations import Expert
+from lagros_envs.arrays import FloatArray
 from lagros_envs.tasks.spacecraft.sensing import global_state
 from lagros_policies.policy import PolicyState
 from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
-
-FloatArray = NDArray[np.float64]
 
 
 class SpacecraftExpert(Expert):

@@ -12,18 +12,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.episodes import TUBE_TOLERANCE, added_up
 from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.keeping import Keepable
-from lagros_benchmarks.run.library import FloatArray
+from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.tasks.spacecraft.task import THRUSTERS
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.policy import BasePolicy, as_policy
-
-BoolArray = NDArray[np.bool_]
 
 # Memories of a policy within those of the filters that it uses.
 _MOST_WRAPPED = 4

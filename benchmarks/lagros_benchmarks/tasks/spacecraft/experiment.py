@@ -11,7 +11,7 @@ import numpy as np
 from lagros_benchmarks.run.episodes import added_up
 from lagros_benchmarks.run.experiment import BenchmarkRun
 from lagros_benchmarks.run.keeping import Kept
-from lagros_benchmarks.run.library import FloatArray, Toolbox, building, built_policy
+from lagros_benchmarks.run.library import Toolbox, building, built_policy
 from lagros_benchmarks.run.settings import BenchmarkSettings, Case
 from lagros_benchmarks.run.workers import Progress
 from lagros_benchmarks.tasks.spacecraft.claims import position_margin
@@ -25,6 +25,7 @@ from lagros_benchmarks.tasks.spacecraft.episodes import (
     make_filter,
 )
 from lagros_benchmarks.tasks.spacecraft.timing import PLAN_WORLDS, Timing, time_plans, time_policy
+from lagros_envs.arrays import FloatArray
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.policy import BasePolicy

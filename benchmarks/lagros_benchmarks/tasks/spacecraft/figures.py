@@ -10,7 +10,6 @@ import numpy as np
 
 from lagros_benchmarks.report.canvas import (
     LONGEST_LABEL,
-    FloatArray,
     Style,
     canvas,
     caption,
@@ -23,6 +22,7 @@ from lagros_benchmarks.report.canvas import (
 )
 from lagros_benchmarks.report.formats import disturbance_title, figure_note, row_label, task_title
 from lagros_benchmarks.run.experiment import Row
+from lagros_envs.arrays import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

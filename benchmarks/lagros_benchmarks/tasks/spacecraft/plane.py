@@ -11,14 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_benchmarks.worst_case.search import SearchSettings, search
+from lagros_envs.arrays import FloatArray, IntArray
 from lagros_policies.contraction.double_integrator import flow
 from lagros_policies.tasks.spacecraft.wrench_control import AxesTracking, Law
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 _STEP = 1e-6
 _STEPS = 60

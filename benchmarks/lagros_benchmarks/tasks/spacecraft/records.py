@@ -11,10 +11,8 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_benchmarks.run.experiment import Row
-from lagros_benchmarks.run.library import FloatArray
 from lagros_benchmarks.run.metrics import (
     cluster_interval,
     cluster_rate_interval,
@@ -26,8 +24,7 @@ from lagros_benchmarks.run.settings import Case
 from lagros_benchmarks.tasks.spacecraft.episodes import AgentRecord, WorldRecord
 from lagros_benchmarks.tasks.spacecraft.experiment import SpacecraftRun
 from lagros_benchmarks.tasks.spacecraft.timing import Timing
-
-BoolArray = NDArray[np.bool_]
+from lagros_envs.arrays import BoolArray, FloatArray
 
 
 def figures(run: SpacecraftRun, case: Case) -> Row:

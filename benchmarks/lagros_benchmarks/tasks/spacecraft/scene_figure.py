@@ -8,19 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lagros_benchmarks.report.canvas import (
-    LONGEST_LABEL,
-    FloatArray,
-    canvas,
-    caption,
-    check_figure_path,
-)
+from lagros_benchmarks.report.canvas import LONGEST_LABEL, canvas, caption, check_figure_path
 from lagros_benchmarks.report.canvas import save as write
 from lagros_benchmarks.report.formats import policy_label
 from lagros_benchmarks.run.library import Toolbox
 from lagros_benchmarks.run.settings import BenchmarkSettings
 from lagros_benchmarks.tasks.spacecraft.episodes import AgentRecord
 from lagros_benchmarks.tasks.spacecraft.experiment import Scene, ScenePanel, fly_scene
+from lagros_envs.arrays import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,8 +10,8 @@ import numpy as np
 
 from lagros_benchmarks.run.flying import Attempt, ask
 from lagros_benchmarks.run.keeping import Keepable
-from lagros_benchmarks.run.library import FloatArray
 from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop
+from lagros_envs.arrays import FloatArray
 from lagros_envs.tasks.spacecraft.task import THRUSTERS
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.policy import BasePolicy

@@ -25,6 +25,7 @@ from lagros_benchmarks.training.sb3_parallel import ParallelVecEnv
 from lagros_benchmarks.training.sb3_vector import SB3VectorEnv
 from lagros_benchmarks.training.settings import CURVE, FINAL
 from lagros_envs import spacecraft_v0
+from lagros_envs.arrays import FloatArray
 from lagros_envs.conventions import beyond_the_end
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.tasks.spacecraft.scenarios import preset_named
@@ -42,7 +43,6 @@ from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.setup import spacecraft_range
 from lagros_policies.trained_for import weights_record
 
-FloatArray = NDArray[np.float64]
 RATES = ("success", "strict_success", "paper_success", "collided")
 
 

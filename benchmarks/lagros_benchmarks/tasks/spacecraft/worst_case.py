@@ -11,19 +11,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop
 from lagros_benchmarks.worst_case.goals import GOALS
+from lagros_envs.arrays import FloatArray
 from lagros_envs.disturbances import Situation, onto_unit_sphere
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.policy import BasePolicy, as_policy
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Towards the nearest thing, across that, away from the goal, along the own way, away from the plan,
 # along both axes of the arena; the lookahead; how d divides between position and velocity.
