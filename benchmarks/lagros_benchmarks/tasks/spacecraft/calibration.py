@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lagros_benchmarks.evidence.calibration import EpisodeScores, Score, calibrated, conditions
-from lagros_benchmarks.tasks.spacecraft.episodes import fly_chunk
+from lagros_benchmarks.tasks.spacecraft.episodes import fly_chunk, make_worlds
 from lagros_benchmarks.worst_case.seeds import CALIBRATION
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
@@ -45,15 +45,7 @@ def spacecraft_scores(
     begun = perf_counter()
 
     def worlds(number: int) -> SpacecraftVectorEnv:
-        return SpacecraftVectorEnv(
-            number * agents,
-            agents,
-            preset,
-            kind,
-            bound,
-            compiled=False,
-            autoreset_mode="disabled",
-        )
+        return make_worlds(number, agents, preset, kind, bound)
 
     policy: Any = make("centralized", worlds(1))
     seeds = episode_seeds(seed, count, namespace)

@@ -148,8 +148,8 @@ class Trace:
     left_paper: BoolArray = field(default_factory=lambda: np.zeros((0, 0), bool))
     position_error: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     path: list[FloatArray] = field(default_factory=list)
-    _going: BoolArray = field(default_factory=lambda: np.zeros((0, 0), bool))
-    _start: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 6)))
+    _going: BoolArray = field(init=False)
+    _start: FloatArray = field(init=False)
 
     def note(self, loop: WorldsLoop) -> None:
         """Note where everybody is and how each fared."""
@@ -179,6 +179,13 @@ class Trace:
         distance = np.linalg.norm(error[..., :2], axis=-1)
         largest = np.maximum(self.position_error, distance)
         self.position_error = np.where(self._going, largest, self.position_error)
+
+
+def make_worlds(worlds: int, agents: int, *args: Any, **options: Any) -> SpacecraftVectorEnv:
+    """Return worlds that stand still where they have ended; see the environment for the rest."""
+    # The figures must not depend on whether numba is installed.
+    options |= {"compiled": False, "autoreset_mode": "disabled"}
+    return SpacecraftVectorEnv(worlds * agents, agents, *args, **options)
 
 
 def shapes_of(policy: BasePolicy, worlds: int, agents: int) -> list[tuple[int, ...]]:

@@ -23,6 +23,7 @@ from lagros_benchmarks.tasks.spacecraft.episodes import (
     fly,
     fly_chunk,
     make_filter,
+    make_worlds,
 )
 from lagros_benchmarks.tasks.spacecraft.timing import PLAN_WORLDS, Timing, time_plans, time_policy
 from lagros_envs.arrays import FloatArray
@@ -113,17 +114,9 @@ class SpacecraftExperiment:
 
     def environment(self, case: Case, worlds: int) -> SpacecraftVectorEnv:
         """Return worlds of a case."""
-        agents = case.agents or 1
-        return SpacecraftVectorEnv(
-            worlds * agents,
-            agents,
-            self.settings.preset or "paper",
-            case.condition.kind,
-            case.condition.bound,
-            "all" if self.settings.channels == "all" else "rates",
-            # The figures must not depend on whether numba is installed.
-            compiled=False,
-            autoreset_mode="disabled",
+        preset = self.settings.preset or "paper"
+        return make_worlds(
+            worlds, case.agents or 1, preset, *case.condition, self.settings.channels
         )
 
     def policy(self, case: Case, env: SpacecraftVectorEnv) -> BasePolicy:

@@ -6,11 +6,12 @@ agents stands one over worlds; comparisons and efforts have theirs over worlds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lagros_benchmarks.run.experiment import Row
 from lagros_benchmarks.run.metrics import (
@@ -21,10 +22,10 @@ from lagros_benchmarks.run.metrics import (
     wilson_interval,
 )
 from lagros_benchmarks.run.settings import Case
-from lagros_benchmarks.tasks.spacecraft.episodes import AgentRecord, WorldRecord
+from lagros_benchmarks.tasks.spacecraft.episodes import WorldRecord
 from lagros_benchmarks.tasks.spacecraft.experiment import SpacecraftRun
 from lagros_benchmarks.tasks.spacecraft.timing import Timing
-from lagros_envs.arrays import BoolArray, FloatArray
+from lagros_envs.arrays import BoolArray
 
 
 def figures(run: SpacecraftRun, case: Case) -> Row:
@@ -58,14 +59,9 @@ def episode_objects(run: SpacecraftRun) -> Iterable[dict[str, Any]]:
                 }
 
 
-def _flags(worlds: Sequence[WorldRecord], what: Callable[[AgentRecord], Any]) -> BoolArray:
-    """Return a flag of every agent, shape (worlds, agents)."""
-    return np.array([[bool(what(agent)) for agent in world.agents] for world in worlds])
-
-
-def _numbers(worlds: Sequence[WorldRecord], what: Callable[[AgentRecord], float]) -> FloatArray:
-    """Return a number of every agent, shape (worlds, agents)."""
-    return np.array([[what(agent) for agent in world.agents] for world in worlds])
+def _each(worlds: Sequence[WorldRecord], name: str) -> NDArray[Any]:
+    """Return a flag or number of every agent, shape (worlds, agents)."""
+    return np.array([[getattr(agent, name) for agent in world.agents] for world in worlds])
 
 
 def _rate(name: str, flags: BoolArray) -> Row:
@@ -81,14 +77,14 @@ def _rate(name: str, flags: BoolArray) -> Row:
 
 def _outcomes(worlds: Sequence[WorldRecord]) -> Row:
     times = [a.success_time for w in worlds for a in w.agents if a.success_time is not None]
-    success = _flags(worlds, lambda agent: agent.success)
+    success = _each(worlds, "success")
     planned = [world.planned for world in worlds]
     with_plan = np.array([bool(one) for one in planned])
     row: Row = {
         **_rate("success", success),
-        **_rate("strict_success", _flags(worlds, lambda agent: agent.strict_success)),
-        **_rate("paper_success", _flags(worlds, lambda agent: agent.paper_success)),
-        **_rate("collision", _flags(worlds, lambda agent: agent.collided)),
+        **_rate("strict_success", _each(worlds, "strict_success")),
+        **_rate("paper_success", _each(worlds, "paper_success")),
+        **_rate("collision", _each(worlds, "collided")),
         "world_success_rate": float(success.all(axis=1).mean()),
         "success_time_median_s": float(np.median(times)) if times else None,
         "plan_rate": None if None in planned else float(with_plan.mean()),
@@ -102,10 +98,10 @@ def _outcomes(worlds: Sequence[WorldRecord]) -> Row:
 def _efforts(worlds: Sequence[WorldRecord]) -> Row:
     """Efforts of all agents but those whose world raised before they had succeeded."""
     whole = np.array([world.error is None for world in worlds])
-    known = whole[:, None] | _flags(worlds, lambda agent: agent.success)
-    efforts = np.where(known, _numbers(worlds, lambda agent: agent.effort), 0.0)
-    solved = _flags(worlds, lambda agent: agent.success)
-    totals = _numbers(worlds, lambda agent: agent.effort_total)[whole]
+    known = whole[:, None] | _each(worlds, "success")
+    efforts = np.where(known, _each(worlds, "effort"), 0.0)
+    solved = _each(worlds, "success")
+    totals = _each(worlds, "effort_total")[whole]
     return {
         "effort_mean": float(efforts.sum() / known.sum()) if known.any() else None,
         "effort_ci95": cluster_interval(efforts.sum(axis=1), known.sum(axis=1)),
@@ -159,8 +155,8 @@ def _tracking(worlds: Sequence[WorldRecord]) -> Row:
 
 def comparison(ours: Sequence[WorldRecord], theirs: Sequence[WorldRecord]) -> Row:
     """Return the difference in success and the ratio of efforts of the agents that both solve."""
-    mine = _flags(ours, lambda agent: agent.success)
-    other = _flags(theirs, lambda agent: agent.success)
+    mine = _each(ours, "success")
+    other = _each(theirs, "success")
     success = paired_success_difference(mine.ravel().tolist(), other.ravel().tolist())
     counts = np.full(len(mine), mine.shape[1])
     change = (mine.astype(int) - other.astype(int)).sum(axis=1)
@@ -168,8 +164,8 @@ def comparison(ours: Sequence[WorldRecord], theirs: Sequence[WorldRecord]) -> Ro
     # stands for both.
     alike = bool(np.all(change == change[0]))
     both = mine & other
-    spent = np.where(both, _numbers(ours, lambda agent: agent.effort), 0.0)
-    reference = np.where(both, _numbers(theirs, lambda agent: agent.effort), 0.0)
+    spent = np.where(both, _each(ours, "effort"), 0.0)
+    reference = np.where(both, _each(theirs, "effort"), 0.0)
     measurable = reference.sum() > 0.0
     return {
         "success_difference": success.difference,

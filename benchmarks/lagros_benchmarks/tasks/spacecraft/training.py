@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from lagros_benchmarks.run.metrics import cluster_rate_interval
 from lagros_benchmarks.tasks.spacecraft.course import SpacecraftTraining
+from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, make_worlds
 from lagros_benchmarks.training.agent import actor_network
 from lagros_benchmarks.training.run import rounded
 from lagros_benchmarks.training.sb3_parallel import ParallelVecEnv
@@ -26,7 +27,6 @@ from lagros_benchmarks.training.sb3_vector import SB3VectorEnv
 from lagros_benchmarks.training.settings import CURVE, FINAL
 from lagros_envs import spacecraft_v0
 from lagros_envs.arrays import FloatArray
-from lagros_envs.conventions import beyond_the_end
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.tasks.spacecraft.scenarios import preset_named
 from lagros_envs.tasks.spacecraft.sensing import Layout
@@ -271,22 +271,11 @@ def evaluate(
     There is a world for each seed. The measures are the environment's own at the end of the
     episode, each of shape (worlds * agents,).
     """
-    env = SpacecraftVectorEnv(
-        len(seeds) * agents,
-        agents,
-        preset,
-        disturbance,
-        bound,
-        settings=policy.settings,
-        compiled=False,
-        autoreset_mode="disabled",
-    )
-    observation, info = env.reset(seed=list(seeds))
-    for _ in range(policy.settings.steps):
-        action, _ = policy.predict(observation)
-        with beyond_the_end():
-            observation, _, _, _, info = env.step(action)
-    return {name: info[name] for name in (*RATES, "effort_to_success", "success_time")}
+    env = make_worlds(len(seeds), agents, preset, disturbance, bound, settings=policy.settings)
+    loop = WorldsLoop(env, policy, past_the_end=True)
+    for _ in loop.fly(list(seeds)):
+        pass
+    return {name: loop.info[name] for name in (*RATES, "effort_to_success", "success_time")}
 
 
 def summary(measures: dict[str, NDArray[Any]]) -> dict[str, float]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lagros_benchmarks.run.flying import Attempt
-from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop
+from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, make_worlds
 from lagros_benchmarks.worst_case.goals import GOALS
 from lagros_envs.arrays import FloatArray
 from lagros_envs.disturbances import Situation, onto_unit_sphere
@@ -167,15 +167,7 @@ class SpacecraftTarget:
 
     def environment(self, worlds: int, disturbance: Any) -> SpacecraftVectorEnv:
         """Return worlds under a disturbance."""
-        return SpacecraftVectorEnv(
-            worlds * self.agents,
-            self.agents,
-            self.preset,
-            disturbance,
-            self.bound,
-            compiled=False,
-            autoreset_mode="disabled",
-        )
+        return make_worlds(worlds, self.agents, self.preset, disturbance, self.bound)
 
     def try_adversaries(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return how bad each adversary is, shape (worlds,), and its d as in `SpacecraftFlights`.
