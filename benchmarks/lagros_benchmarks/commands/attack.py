@@ -50,8 +50,7 @@ def attack(
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of episodes and search.")] = 0,
     method: Annotated[
-        str,
-        typer.Option(help="Of random, cross-entropy, cma, gradient, hybrid; for one body."),
+        str, typer.Option(help="Of random, cross-entropy, cma, gradient, hybrid; for one body.")
     ] = "hybrid",
     safety_filter: Annotated[
         bool, typer.Option("--safety-filter", help="Put the safety filter on the policy.")
@@ -74,8 +73,7 @@ def attack(
     try:
         if replay is not None:
             refuse_options(
-                options_given(but=("--replay", "--policy")),
-                "--replay flies what the file says",
+                options_given(but=("--replay", "--policy")), "--replay flies what the file says"
             )
             _replay(task, policy, replay)
             return

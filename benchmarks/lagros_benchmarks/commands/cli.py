@@ -83,8 +83,7 @@ def bench(
     policies: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME[,NAME]",
-            help="{policies} Or a stable-baselines3 .zip, or module:Class.",
+            metavar="NAME[,NAME]", help="{policies} Or a stable-baselines3 .zip, or module:Class."
         ),
     ] = None,
     episodes: Annotated[
@@ -92,11 +91,7 @@ def bench(
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed; its episodes never occur in training.")] = 0,
     disturbance: Annotated[
-        str,
-        typer.Option(
-            metavar="KIND[,KIND]",
-            help="Of {disturbances}.",
-        ),
+        str, typer.Option(metavar="KIND[,KIND]", help="Of {disturbances}.")
     ] = "uniform",
     bound: Annotated[
         str | None,
@@ -110,10 +105,7 @@ def bench(
         str | None,
         typer.Option(metavar="N[,N]", help="Agents in a world, {agents}; several compare them."),
     ] = None,
-    preset: Annotated[
-        str | None,
-        typer.Option(help="Kind of worlds of agents: {presets}."),
-    ] = None,
+    preset: Annotated[str | None, typer.Option(help="Kind of worlds of agents: {presets}.")] = None,
     safety_filter: Annotated[
         str | None,
         typer.Option(help="Of agents: none, all (policies use it) or both; {safety_filter}."),
@@ -244,8 +236,7 @@ def reproduce(
     backend: Annotated[str, BACKEND_OPTION] = "loky",
     address: Annotated[str | None, ADDRESS_OPTION] = None,
     episodes: Annotated[
-        int | None,
-        typer.Option(help="Episodes (worlds) of each policy in the table."),
+        int | None, typer.Option(help="Episodes (worlds) of each policy in the table.")
     ] = None,
     shipped: Annotated[
         bool, typer.Option("--shipped-weights", help="Only the benchmark, with what is shipped.")

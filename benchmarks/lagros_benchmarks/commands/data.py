@@ -52,8 +52,7 @@ def export(
     ] = "uniform",
     bound: Annotated[float | None, BOUND] = None,
     out: Annotated[
-        Path,
-        typer.Option(file_okay=False, help=f"Folder of datasets; Minari's {DATASETS_PATH}."),
+        Path, typer.Option(file_okay=False, help=f"Folder of datasets; Minari's {DATASETS_PATH}.")
     ] = Path("runs/minari"),
 ) -> None:
     """Fly the expert and write its episodes, with the record of metric and planner."""

@@ -26,16 +26,13 @@ TOLERANCE = 1e-5
 
 def export(
     policy: Annotated[
-        str,
-        typer.Argument(help="lagros or learned, and TASK; or both in one, POLICY-TASK."),
+        str, typer.Argument(help="lagros or learned, and TASK; or both in one, POLICY-TASK.")
     ],
     task: Annotated[
-        str | None,
-        typer.Argument(help="A name, module:attribute or ./file.py, if not in POLICY."),
+        str | None, typer.Argument(help="A name, module:attribute or ./file.py, if not in POLICY.")
     ] = None,
     format_: Annotated[
-        str,
-        typer.Option("--format", metavar="FORMAT", help="c (one C99 file) or onnx."),
+        str, typer.Option("--format", metavar="FORMAT", help="c (one C99 file) or onnx.")
     ] = "c",
     out: Annotated[Path | None, file_option("Where to; POLICY_TASK.c or .onnx.")] = None,
     weights: Annotated[

@@ -129,10 +129,7 @@ class Delivery:
         self._texts: list[str] = []
 
     def write(
-        self,
-        path: Path | None,
-        write: Callable[[Path], Any],
-        text: Callable[[], str] | None = None,
+        self, path: Path | None, write: Callable[[Path], Any], text: Callable[[], str] | None = None
     ) -> None:
         """Write one file.
 

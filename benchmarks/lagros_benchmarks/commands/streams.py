@@ -111,10 +111,7 @@ def _patient(stream: Any, kept: bytearray | None = None) -> TextIO:
             stream.flush()
     buffer: Any = _Patient(getattr(stream, "buffer", None), kept)
     return io.TextIOWrapper(
-        buffer,
-        getattr(stream, "encoding", None) or "utf-8",
-        "replace",
-        write_through=True,
+        buffer, getattr(stream, "encoding", None) or "utf-8", "replace", write_through=True
     )
 
 

@@ -33,16 +33,13 @@ def train(
         typer.Option(metavar="NAME[,NAME]", help="One body: of ppo, sac, td3. Many agents: ppo."),
     ] = "ppo",
     seed: Annotated[
-        str,
-        typer.Option(metavar="N[,N]", help="Seeds; their episodes never occur in evaluation."),
+        str, typer.Option(metavar="N[,N]", help="Seeds; their episodes never occur in evaluation.")
     ] = "0",
     out: Annotated[
-        Path,
-        typer.Option(file_okay=False, help="Folder of the runs, TASK-ALGO/seed-N each."),
+        Path, typer.Option(file_okay=False, help="Folder of the runs, TASK-ALGO/seed-N each.")
     ] = RUNS,
     segments: Annotated[
-        int | None,
-        typer.Option(help="Length of a run; each segment ends with a checkpoint."),
+        int | None, typer.Option(help="Length of a run; each segment ends with a checkpoint.")
     ] = None,
     residual: Annotated[
         float | None,

@@ -25,20 +25,17 @@ def watch(
     policy: Annotated[
         str,
         typer.Option(
-            metavar="NAME",
-            help="A policy of the task, a stable-baselines3 .zip, or module:Class.",
+            metavar="NAME", help="A policy of the task, a stable-baselines3 .zip, or module:Class."
         ),
     ] = "lagros",
     agents: Annotated[
         int | None, typer.Option(help="Number of agents; the preset's own if not given.")
     ] = None,
     preset: Annotated[
-        str | None,
-        typer.Option(help="Of paper, released, crossing, open, swarm. (default: paper)"),
+        str | None, typer.Option(help="Of paper, released, crossing, open, swarm. (default: paper)")
     ] = None,
     disturbance: Annotated[
-        str,
-        typer.Option(help="Of none, uniform, sphere, constant, sinusoid, gust."),
+        str, typer.Option(help="Of none, uniform, sphere, constant, sinusoid, gust.")
     ] = "uniform",
     bound: Annotated[float | None, BOUND] = None,
     seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
