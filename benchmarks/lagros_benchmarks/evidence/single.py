@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 from lagros_benchmarks.evidence.calibration import single_statements
 from lagros_benchmarks.evidence.records import recorded
 from lagros_benchmarks.worst_case.flights import (
+    Flights,
     draw_episodes,
     expert_of,
     fly,
@@ -71,27 +72,19 @@ class Question:
 
 
 @dataclass(frozen=True)
-class SingleFlights:
-    """Episodes of one body, one row each.
+class SingleFlights(Flights):
+    """Episodes of one body, one row each; attributes as in `Flights`, and these.
 
     Attributes:
-        states: x at the control instants, shape (e, steps + 1, n).
-        plans: x_d, likewise.
+        plans: x_d at the control instants, shape (e, steps + 1, n).
         nominal: u_d, shape (e, steps, m).
-        controls: u, likewise.
-        fallen: Which of them fell, shape (e,).
-        collided: Which of them met a disc, shape (e,).
         unplanned: Starts without a plan, which were not flown.
         period: Control period [s].
         seconds: Time taken [s].
     """
 
-    states: FloatArray
     plans: FloatArray
     nominal: FloatArray
-    controls: FloatArray
-    fallen: BoolArray
-    collided: BoolArray
     unplanned: int
     period: float
     seconds: float
@@ -217,12 +210,12 @@ def fly_kinds(task: Task, policy: str, bound: float, count: int) -> SingleFlight
     law = law_of(policy, expert, episodes)
     flown = [fly(episodes, law, every, random_pushes(episodes, kind, bound)) for kind in KINDS]
     return SingleFlights(
-        states=np.concatenate([flight.states for flight in flown]),
+        **{
+            one.name: np.concatenate([getattr(flight, one.name) for flight in flown])
+            for one in fields(Flights)
+        },
         plans=np.tile(episodes.plans, (len(flown), 1, 1)),
         nominal=np.tile(episodes.controls, (len(flown), 1, 1)),
-        controls=np.concatenate([flight.controls for flight in flown]),
-        fallen=np.concatenate([flight.fallen for flight in flown]),
-        collided=np.concatenate([flight.collided for flight in flown]),
         unplanned=len(episodes.unplanned),
         period=task.control_period,
         seconds=time.monotonic() - begun,
@@ -243,7 +236,7 @@ def met_error(
     state, nominal = flights.states[:, :-1], flights.plans[:, :-1]
     if inside is None:
         inside = np.asarray(metric.region.contains(state, nominal, flights.nominal))
-    counted = inside & ~(flights.fallen | flights.collided)[:, None]
+    counted = inside & ~flights.lost[:, None]
     # At e = 0 nothing is asked of the control.
     counted &= np.abs(state - nominal).max(axis=-1) > 0.0
     samples = Samples(state[counted], nominal[counted], flights.nominal[counted])
@@ -264,13 +257,12 @@ def tube_line(flights: SingleFlights, policy: str, bound: float) -> tuple[Statem
     Nothing certified is counted against them: their control is held and all states are disturbed.
     """
     begun = time.monotonic()
-    whole = ~(flights.fallen | flights.collided)
-    error = np.linalg.norm(flights.states - flights.plans, axis=-1)[whole]
+    error = np.linalg.norm(flights.states - flights.plans, axis=-1)[~flights.lost]
     largest = float(error.max(initial=0.0))
     collided = int(np.count_nonzero(flights.collided))
     text = (
         f"{policy}, held {flights.period:g} s, d_bar = {bound:g} ({', '.join(KINDS)}): the "
-        f"largest ||x - x_d|| of {len(whole)} episodes is {largest:.4g}; "
+        f"largest ||x - x_d|| of {len(flights.lost)} episodes is {largest:.4g}; "
         f"{int(np.count_nonzero(flights.fallen))} fell, "
         + (f"{collided} collided, " if collided else "")
         + f"{flights.unplanned} starts had no plan"

@@ -125,12 +125,9 @@ def number(value: float | None) -> str:
         return f"{value:.0e}".replace("+0", "").replace("+", "")
     decimals = max(_DIGITS - len(str(int(abs(value)))), 0)
     if abs(value) < 1:
-        decimals = _DIGITS - 1 - _exponent(value)
+        exponent = int(f"{abs(value):e}".partition("e")[2])
+        decimals = _DIGITS - 1 - exponent
     return f"{value:.{decimals}f}"
-
-
-def _exponent(value: float) -> int:
-    return int(f"{abs(value):e}".partition("e")[2])
 
 
 def percent(rate: float | None) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import itertools
 import subprocess
@@ -19,6 +20,11 @@ Frame = NDArray[np.uint8]
 
 # Frames per second from which on what moves is seen to move. A GIF has few of them: it is large.
 FRAME_RATES = {".gif": 12.0, ".mp4": 25.0}
+# What writes each: module, package, extra, and what else can be done.
+_WRITERS = {
+    ".gif": ("PIL.Image", "pillow", "bench", ""),
+    ".mp4": ("imageio_ffmpeg", "imageio-ffmpeg", "video", "; or write a .gif"),
+}
 # A GIF's palette is taken from so many frames. Its first half are the commonest colours, which
 # are the areas of the drawing, exact; the rest are others that are far from all of these: fewer
 # shades at the edges take fewer bytes.
@@ -37,10 +43,7 @@ def check_video_path(path: Path) -> None:
     suffix = path.suffix.lower()
     if suffix not in FRAME_RATES:
         raise ValueError(f"video {str(path)!r} must end in .gif or .mp4")
-    if suffix == ".mp4":
-        _import_ffmpeg()
-    else:
-        _import_pillow()
+    _writer(suffix)
 
 
 def video_bytes(kind: str, frames: Iterable[Frame], rate: float) -> bytes:
@@ -65,7 +68,7 @@ def gif_bytes(frames: Iterable[Frame], rate: float) -> bytes:
     One palette without dithering leaves what does not move unchanged from frame to frame, and what
     is unchanged is left out.
     """
-    image = _import_pillow()
+    image = _writer(".gif")
     # Drawings compress a hundredfold, so that a long episode fits into memory.
     packed, shape = [], (0, 0, 0)
     for frame in frames:
@@ -118,7 +121,7 @@ def common_colours(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _mp4_bytes(frames: Iterable[Frame], rate: float) -> bytes:
-    ffmpeg = _import_ffmpeg()
+    ffmpeg = _writer(".mp4")
     iterator: Iterator[Frame] = iter(frames)
     first = next(iterator, None)
     if first is None:
@@ -147,22 +150,13 @@ def _mp4_bytes(frames: Iterable[Frame], rate: float) -> bytes:
         return film.read_bytes()
 
 
-def _import_ffmpeg() -> Any:
+def _writer(kind: str) -> Any:
+    """Import what writes a kind of film."""
+    module, package, extra, instead = _WRITERS[kind]
     try:
-        import imageio_ffmpeg
+        return importlib.import_module(module)
     except ImportError as error:
         raise ImportError(
-            'an .mp4 needs imageio-ffmpeg, which is not installed: pip install "lagros[video]"; '
-            "or write a .gif"
+            f"{'a' if kind == '.gif' else 'an'} {kind} needs {package}, which is not installed: "
+            f'pip install "lagros[{extra}]"{instead}'
         ) from error
-    return imageio_ffmpeg
-
-
-def _import_pillow() -> Any:
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError(
-            'a .gif needs pillow, which is not installed: pip install "lagros[bench]"'
-        ) from error
-    return Image

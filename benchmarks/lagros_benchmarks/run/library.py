@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -141,10 +141,6 @@ class Toolbox:
     load_metric: Callable[[Any, str | None], Callable[[FloatArray], FloatArray]] = load_metric
     make_filter: Callable[[BasePolicy, Any, float], BasePolicy] | None = None
     position_margin: Callable[[BasePolicy, float], float | None] | None = None
-
-    def with_policies(self, policies: Mapping[str, Any]) -> Toolbox:
-        """Return the same with some policies that are objects, each copied wherever it is built."""
-        return replace(self, make_policy=GivenPolicies(policies, self.make_policy))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import Any
 from lagros_benchmarks.run.experiment import BenchmarkRun, Experiment
 from lagros_benchmarks.run.fingerprints import fingerprint
 from lagros_benchmarks.run.keeping import Kept
-from lagros_benchmarks.run.library import Toolbox
+from lagros_benchmarks.run.library import GivenPolicies, Toolbox
 from lagros_benchmarks.run.room import room_of
 from lagros_benchmarks.run.settings import BenchmarkSettings, Case
 from lagros_benchmarks.run.workers import Progress, gather, split
@@ -167,4 +167,6 @@ def _with_policies(
         if name in taken:
             raise ValueError(f"policies: {name!r} is a policy of this package; take another name")
     names = dict.fromkeys((*settings.policies, *policies))
-    return replace(settings, policies=tuple(names)), (toolbox or Toolbox()).with_policies(policies)
+    before = toolbox or Toolbox()
+    made = replace(before, make_policy=GivenPolicies(policies, before.make_policy))
+    return replace(settings, policies=tuple(names)), made

@@ -11,7 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv
 
-from lagros_benchmarks.training.settings import OffPolicy, Ppo, Sac, Td3, Training
+from lagros_benchmarks.training.settings import Ppo, Sac, Training
 from lagros_policies.learning.networks import Mlp
 
 
@@ -37,34 +37,21 @@ def make_agent(training: Training, venv: VecEnv) -> BaseAlgorithm:
             policy_kwargs={**network, "log_std_init": algorithm.initial_log_std},
             **common,
         )
-    common |= _buffered(algorithm)
-    if isinstance(algorithm, Sac):
-        weight = f"auto_{algorithm.initial_entropy_weight}"
-        return SAC("MlpPolicy", venv, ent_coef=weight, policy_kwargs=network, **common)
-    return _td3(algorithm, venv, network, common)
-
-
-def _td3(algorithm: Td3, venv: VecEnv, network: dict[str, Any], common: dict[str, Any]) -> TD3:
-    count = int(np.prod(venv.action_space.shape or ()))
-    noise = NormalActionNoise(np.zeros(count), np.full(count, algorithm.action_noise))
-    return TD3(
-        "MlpPolicy",
-        venv,
-        action_noise=noise,
-        policy_delay=algorithm.policy_delay,
-        policy_kwargs=network,
-        **common,
-    )
-
-
-def _buffered(algorithm: OffPolicy) -> dict[str, Any]:
-    return {
+    common |= {
         "buffer_size": algorithm.buffer_size,
         "learning_starts": algorithm.warm_up,
         "tau": algorithm.averaging,
         "train_freq": 1,
         "gradient_steps": algorithm.gradient_steps,
+        "policy_kwargs": network,
     }
+    if isinstance(algorithm, Sac):
+        weight = f"auto_{algorithm.initial_entropy_weight}"
+        return SAC("MlpPolicy", venv, ent_coef=weight, **common)
+    count = int(np.prod(venv.action_space.shape or ()))
+    noise = NormalActionNoise(np.zeros(count), np.full(count, algorithm.action_noise))
+    delay = algorithm.policy_delay
+    return TD3("MlpPolicy", venv, action_noise=noise, policy_delay=delay, **common)
 
 
 def actor_network(model: BaseAlgorithm) -> Mlp:

@@ -133,7 +133,9 @@ def train(
         _learn_segment(training, model, segment)
         figures = rounded(made.figures(model))
         curve.append(_point(model, figures, begun, curve))
-        _write_events(model, figures)
+        for name, value in figures.items():
+            model.logger.record(f"evaluation/{name}", value)
+        model.logger.dump(model.num_timesteps)
         _save(place.checkpoint, settings, model, curve)
         _LOG.info("%s %d/%d: %s", place.folder, len(curve), training.segments, _words(curve[-1]))
         if progress is not None:
@@ -269,12 +271,6 @@ def _words(point: dict[str, float]) -> str:
     figures = {name: value for name, value in point.items() if name not in AXES}
     seen = ", ".join(f"{name} {value:.3g}" for name, value in figures.items())
     return f"{point['steps']} steps, {point['seconds']} s, {seen}"
-
-
-def _write_events(model: BaseAlgorithm, figures: dict[str, float]) -> None:
-    for name, value in figures.items():
-        model.logger.record(f"evaluation/{name}", value)
-    model.logger.dump(model.num_timesteps)
 
 
 def _record(

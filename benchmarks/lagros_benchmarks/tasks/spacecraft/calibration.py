@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from lagros_benchmarks.evidence.calibration import EpisodeScores, Score, calibrated, conditions
+from lagros_benchmarks.evidence.calibration import EpisodeScores, Score
 from lagros_benchmarks.tasks.spacecraft.episodes import fly_chunk, make_worlds
 from lagros_benchmarks.worst_case.seeds import CALIBRATION
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
-from lagros_policies.contraction.statement import Statement
 from lagros_policies.policy import make
 
 POSITION_ERROR = Score(
@@ -58,17 +57,3 @@ def spacecraft_scores(
     values = np.array(scores)
     failed = int(np.count_nonzero(np.isinf(values)))
     return EpisodeScores({POSITION_ERROR.name: values}, failed, perf_counter() - begun)
-
-
-def spacecraft_statements(
-    level: float = 0.95, worlds: int = 100, kind: str = "uniform", bound: float = 0.4
-) -> list[Statement]:
-    """Return the calibrated line of the spacecraft's certificate: the position's tube.
-
-    Its probability is `level`; each world takes about a second.
-
-    Raises:
-        ValueError: There are too few worlds for the level.
-    """
-    scores = spacecraft_scores(worlds, kind=kind, bound=bound)
-    return calibrated((POSITION_ERROR,), scores, level, conditions(kind, bound))

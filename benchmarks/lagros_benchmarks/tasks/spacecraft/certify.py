@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from lagros_benchmarks.evidence.calibration import calibrated, conditions
 from lagros_benchmarks.evidence.records import recorded
 from lagros_benchmarks.evidence.single import KINDS, LEAST, LEVEL, Question, UnservedError
 from lagros_benchmarks.tasks.spacecraft.calibration import (
     POSITION_ERROR,
     spacecraft_scores,
-    spacecraft_statements,
 )
 from lagros_benchmarks.worst_case.seeds import CALIBRATION
 from lagros_envs.reading import MOST_TEXT, Record, named, parse_json, read_bytes
@@ -57,7 +57,8 @@ def certify(task: SpacecraftSettings, question: Question) -> Certificate:
         return found
     lines, largest = fly_spacecraft(found, policy, bound, count)
     if count >= LEAST:
-        lines.extend(spacecraft_statements(LEVEL, count, KINDS[0], bound))
+        scores = spacecraft_scores(count, kind=KINDS[0], bound=bound)
+        lines += calibrated((POSITION_ERROR,), scores, LEVEL, conditions(KINDS[0], bound))
     return found.with_evidence(lines, largest)
 
 

@@ -130,7 +130,7 @@ class SpacecraftReproduceSettings:
             name, training = (
                 ("lagros", self.lagros) if last else (f"round{index}", self.intermediate)
             )
-            learner = stage.fit(name, training, parts, _held_out_part(met, self.held_out))
+            learner = stage.fit(name, training, parts, _only(met, _split(met, self.held_out)))
 
     def benchmark(self, folder: Path | None) -> BenchmarkSettings:
         """Return the benchmark of (a), (b), (c) and (d), with a folder's weights or ours."""
@@ -257,16 +257,6 @@ def training_part(data: FlightData, settings: SpacecraftReproduceSettings) -> Fl
     return replace(kept, acceleration=label)
 
 
-def _held_out_part(data: FlightData, share: float) -> FlightData:
-    return _only(data, _split(data, share))
-
-
 def _only(data: FlightData, chosen: np.ndarray[Any, np.dtype[np.bool_]]) -> FlightData:
-    return FlightData(
-        data.observation[chosen],
-        data.acceleration[chosen],
-        data.world[chosen],
-        data.layout,
-        data.plans,
-        data.failed_plans,
-    )
+    rows = {name: getattr(data, name)[chosen] for name in ("observation", "acceleration", "world")}
+    return replace(data, **rows)
