@@ -1,7 +1,4 @@
-"""`lagros attack`: search the bounded disturbance that a policy stands worst.
-
-Only the standard library, typer and `terminal` are imported here; the command imports the rest.
-"""
+"""`lagros attack`: search the bounded disturbance that a policy stands worst."""
 
 from __future__ import annotations
 

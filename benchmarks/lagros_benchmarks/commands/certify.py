@@ -1,7 +1,4 @@
-"""`lagros certify`: what is proved, calibrated and observed of a task, in one certificate.
-
-Only the standard library, typer and `terminal` are imported here; the command imports the rest.
-"""
+"""`lagros certify`: what is proved, calibrated and observed of a task, in one certificate."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The command line `lagros`.
-
-Only the standard library, typer and `terminal` are imported here; what a command needs is imported
-inside it, so that `lagros --help` answers at once.
-"""
+"""The command line `lagros`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""`lagros data`: what the expert did, in the formats of other libraries.
-
-Only the standard library, typer and `terminal` are imported here; the commands import the rest.
-"""
+"""`lagros data`: what the expert did, in the formats of other libraries."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""`lagros export`: a policy as an ONNX model or one C99 file.
-
-Only the standard library, typer and `terminal` are imported here; the command imports the rest.
-"""
+"""`lagros export`: a policy as an ONNX model or one C99 file."""
 
 from __future__ import annotations
 

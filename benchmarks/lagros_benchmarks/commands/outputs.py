@@ -1,7 +1,4 @@
-"""The files of a command: refused before the work or written after it, each on its own.
-
-Only the standard library, typer and `extras` are imported here.
-"""
+"""The files of a command: refused before the work or written after it, each on its own."""
 
 from __future__ import annotations
 

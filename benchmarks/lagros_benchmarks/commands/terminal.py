@@ -1,7 +1,4 @@
-"""What the commands say on the terminal: errors without a traceback, lists, progress.
-
-Only the standard library, typer, `extras`, `process` and `streams` are imported here.
-"""
+"""What the commands say on the terminal: errors without a traceback, lists, progress."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""`lagros train`: reinforcement learning of our tasks with stable-baselines3.
-
-Only the standard library, typer and `terminal` are imported here; the command imports the rest.
-"""
+"""`lagros train`: reinforcement learning of our tasks with stable-baselines3."""
 
 from __future__ import annotations
 

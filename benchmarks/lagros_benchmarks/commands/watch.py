@@ -1,7 +1,4 @@
-"""`lagros watch`: one episode as it moves, in a window or as a video.
-
-Only the standard library, typer and `terminal` are imported here; the command imports the rest.
-"""
+"""`lagros watch`: one episode as it moves, in a window or as a video."""
 
 from __future__ import annotations
 
