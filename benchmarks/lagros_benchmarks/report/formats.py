@@ -164,6 +164,12 @@ def signed(value: float) -> str:
     return f"{value:+.1f}".replace("-", "−")
 
 
+def markdown_rows(columns: Sequence[Column], rows: Sequence[Row]) -> str:
+    """Return the Markdown table of rows."""
+    headings = [f"{heading} [{unit}]" if unit else heading for heading, unit, _ in columns]
+    return markdown_table(headings, [[cell(row).strip() for *_, cell in columns] for row in rows])
+
+
 def markdown_table(headings: Sequence[str], contents: Sequence[Sequence[str]]) -> str:
     """Return a Markdown table, its first column to the left."""
     rule = ["---", *["---:"] * (len(headings) - 1)]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from lagros_benchmarks.report.formats import (
     by_condition,
     condition_title,
-    markdown_table,
+    markdown_rows,
     names_lines,
     raised_lines,
 )
@@ -182,11 +182,8 @@ def markdown_text(rows: Sequence[Row]) -> str:
         grids = texts(rows[0]).markdown_grids(groups)
         return "\n\n".join([*blocks, *grids, *names_lines(rows), *raised_lines(rows)]) + "\n"
     for group in groups:
-        shown = texts(group[0]).columns(group[0])
-        units = [f"{heading} [{unit}]" if unit else heading for heading, unit, _ in shown]
-        ordered = texts(group[0]).ordered(group)
-        contents = [[content(row).strip() for _, _, content in shown] for row in ordered]
-        blocks.append(markdown_table(units, contents))
+        words = texts(group[0])
+        blocks.append(markdown_rows(words.columns(group[0]), words.ordered(group)))
         blocks += _markdown_lines(comparison_lines(group))
         blocks += [*names_lines(group), *raised_lines(group)]
     return "\n\n".join(blocks) + "\n"

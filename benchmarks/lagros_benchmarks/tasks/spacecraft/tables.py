@@ -12,6 +12,7 @@ from lagros_benchmarks.report.formats import (
     condition_title,
     disturbance_title,
     mark,
+    markdown_rows,
     markdown_table,
     milliseconds,
     number,
@@ -221,14 +222,9 @@ def markdown_grids(groups: Sequence[Sequence[Row]]) -> list[str]:
     rows = [row for group in groups for row in group]
     blocks = []
     for name, headings, contents in sweeps(rows):
-        blocks += [name.replace("\n", ": "), markdown_table(headings, _trimmed(contents))]
+        trimmed = [[cell.strip() for cell in line] for line in contents]
+        blocks += [name.replace("\n", ": "), markdown_table(headings, trimmed)]
     swept = [row for series in _series(rows) for row in series]
     for group in (group for group in groups if group[0] not in swept):
-        headings = [f"{heading} [{unit}]" if unit else heading for heading, unit, _ in _COLUMNS]
-        lines = [[content(row) for _, _, content in _COLUMNS] for row in ordered(group)]
-        blocks += [condition_title(group[0]), markdown_table(headings, _trimmed(lines))]
+        blocks += [condition_title(group[0]), markdown_rows(_COLUMNS, ordered(group))]
     return blocks
-
-
-def _trimmed(contents: Sequence[Sequence[str]]) -> list[list[str]]:
-    return [[cell.strip() for cell in line] for line in contents]
