@@ -128,12 +128,9 @@ class Delivery:
     def write(
         self, path: Path | None, write: Callable[[Path], Any], text: Callable[[], str] | None = None
     ) -> None:
-        """Write one file.
+        """Write one file, unless the path is None, by a function that takes it.
 
-        Args:
-            path: Where to; None leaves it out.
-            write: Takes a path and writes the file.
-            text: Returns what to print if there is no place left; None for what is no text.
+        The text is what to print if there is no place left; None for what is no text.
         """
         if path is None:
             return

@@ -168,15 +168,9 @@ def cluster_interval(
 
     Whole clusters are resampled, so that what happens to the agents of one world may depend on each
     other as it likes. A rate is successes over agents, a mean is totals over counts, a ratio of
-    means is totals over totals.
-
-    Args:
-        numerators: One per cluster.
-        denominators: One per cluster, none negative; a cluster with zero has nothing to say and is
-            left out.
-
-    Returns:
-        The interval, or None for fewer than two clusters, or if a number is not finite.
+    means is totals over totals. A cluster whose denominator is zero has nothing to say and is left
+    out; none is negative. There is no interval for fewer than two clusters, or if a number is not
+    finite.
     """
     above = np.asarray(numerators, dtype=np.float64)
     below = np.asarray(denominators, dtype=np.float64)
@@ -194,10 +188,6 @@ def cluster_rate_interval(successes: Sequence[int], trials: Sequence[int]) -> In
 
     Where all trials agree, resampling has no spread; the interval is then Wilson's with the
     clusters as trials, which is right however much the trials of a cluster depend on each other.
-
-    Args:
-        successes: One count per cluster.
-        trials: One count per cluster.
 
     Raises:
         ValueError: There are no trials, or more successes than trials.

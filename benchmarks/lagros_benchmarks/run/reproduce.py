@@ -194,14 +194,7 @@ def _weights(folder: Path, task: Task, name: str) -> Path:
 
 
 class _Making:
-    """One run: what it makes of its settings, and where.
-
-    Args:
-        settings: Of the run.
-        folder: Where everything is kept.
-        progress: Called with a title, the units done and the units in all.
-        say: Called with a line after each stage.
-    """
+    """One run: what it makes of its settings in a folder; see `reproduction.reproduce`."""
 
     def __init__(
         self, settings: ReproduceSettings, folder: Path, progress: Progress, say: Say

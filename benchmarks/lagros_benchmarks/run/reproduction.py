@@ -28,13 +28,7 @@ class Reproduction(Protocol):
 
     @classmethod
     def for_task(cls, task: str, episodes: int | None, **asked: Any) -> Reproduction:
-        """Return the settings of a run.
-
-        Args:
-            task: The task, as it was asked for.
-            episodes: Episodes, or worlds, of each policy in the table; None for the usual number.
-            asked: `jobs` and `backend`.
-        """
+        """Return the settings of a run, with the usual number of episodes if None."""
 
     def make(self, folder: Path, progress: Progress, say: Say) -> None:
         """Make what is not yet in the folder."""

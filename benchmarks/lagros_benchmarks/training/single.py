@@ -203,13 +203,7 @@ def _features(model: BaseAlgorithm) -> NDArray[Any]:
 
 
 def evaluate(policy: Any, seeds: list[int], disturbance: str, bound: float) -> dict[str, float]:
-    """Run a policy that remembers nothing over episodes and return its figures.
-
-    Args:
-        policy: The policy; it has the attribute `settings`.
-        seeds: Of the episodes.
-        disturbance: Kind of disturbance.
-        bound: d_bar, in units of the state per second.
+    """Run a policy that remembers nothing over episodes of its `settings` and return its figures.
 
     Returns:
         Shares of episodes: `success` (the paper's), `strict` (inside the tube at the end, never

@@ -189,18 +189,14 @@ class SingleBench:
             say(f"without u* to hold the flights against: {error}")
             return Planning(self.task, planner_of(self.task))
 
-    def law(self) -> Law:
-        """Return the policy as a law; for tube MPC u* around its plan, which it confirms."""
-        if self.tracks:
-            return tracking_law(self.expert, self.episodes)
-        return policy_law(self.policy, self.episodes)
-
     def search(self, say: Callable[[str], None]) -> list[Found]:
         """Search the worst sequence of every episode."""
         say("searching")
+        # For tube MPC u* around its plan, which it confirms.
+        tracked = tracking_law(self.expert, self.episodes) if self.tracks else None
         target = SingleTarget(
             self.episodes,
-            self.law(),
+            tracked or policy_law(self.policy, self.episodes),
             self.settings.goal,
             self.settings.bound,
             None if self.expert.metric is None else energy_adversary(self.expert.metric),

@@ -32,14 +32,7 @@ def spacecraft_scores(
 ) -> EpisodeScores:
     """Fly worlds of the centralised policy and return the largest position error of each.
 
-    Args:
-        count: Worlds.
-        namespace: Of the seeds.
-        seed: Seed of the run.
-        kind: Kind of the disturbance.
-        bound: d_bar, in units of the state per second.
-        preset: Preset of the scenarios.
-        agents: Agents of each world.
+    See `evidence.calibration.single_scores`; preset and agents are those of the worlds.
     """
     begun = perf_counter()
 
