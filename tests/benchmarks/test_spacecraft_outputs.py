@@ -50,7 +50,7 @@ def short_episodes():
     """A fifth of the time is enough for what is printed and drawn."""
     short = functools.partial(SpacecraftVectorEnv, settings=SpacecraftSettings(time_limit=9.0))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lagros_benchmarks.tasks.spacecraft.experiment.SpacecraftVectorEnv", short)
+        patch.setattr("lagros_benchmarks.tasks.spacecraft.episodes.SpacecraftVectorEnv", short)
         yield
 
 

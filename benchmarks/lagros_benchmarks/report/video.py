@@ -22,7 +22,7 @@ Frame = NDArray[np.uint8]
 FRAME_RATES = {".gif": 12.0, ".mp4": 25.0}
 # What writes each: module, package, extra, and what else can be done.
 _WRITERS = {
-    ".gif": ("PIL.Image", "pillow", "bench", ""),
+    ".gif": ("PIL", "pillow", "bench", ""),
     ".mp4": ("imageio_ffmpeg", "imageio-ffmpeg", "video", "; or write a .gif"),
 }
 # A GIF's palette is taken from so many frames. Its first half are the commonest colours, which
@@ -68,7 +68,9 @@ def gif_bytes(frames: Iterable[Frame], rate: float) -> bytes:
     One palette without dithering leaves what does not move unchanged from frame to frame, and what
     is unchanged is left out.
     """
-    image = _writer(".gif")
+    _writer(".gif")
+    from PIL import Image as image
+
     # Drawings compress a hundredfold, so that a long episode fits into memory.
     packed, shape = [], (0, 0, 0)
     for frame in frames:
