@@ -69,7 +69,7 @@ def gif_bytes(frames: Iterable[Frame], rate: float) -> bytes:
     is unchanged is left out.
     """
     _writer(".gif")
-    from PIL import Image as image
+    from PIL import Image
 
     # Drawings compress a hundredfold, so that a long episode fits into memory.
     packed, shape = [], (0, 0, 0)
@@ -80,13 +80,13 @@ def gif_bytes(frames: Iterable[Frame], rate: float) -> bytes:
         raise ValueError("there is no frame to write")
 
     def unpacked(data: bytes) -> Any:
-        return image.fromarray(np.frombuffer(zlib.decompress(data), np.uint8).reshape(shape))
+        return Image.fromarray(np.frombuffer(zlib.decompress(data), np.uint8).reshape(shape))
 
     chosen = np.unique(np.linspace(0, len(packed) - 1, _PALETTE_FRAMES).round().astype(int))
     sample = np.concatenate([np.asarray(unpacked(packed[index])) for index in chosen])
-    palette = image.new("P", (1, 1))
+    palette = Image.new("P", (1, 1))
     palette.putpalette(common_colours(sample).ravel().tolist())
-    images = (unpacked(one).quantize(palette=palette, dither=image.Dither.NONE) for one in packed)
+    images = (unpacked(one).quantize(palette=palette, dither=Image.Dither.NONE) for one in packed)
     # In hundredths of a second, rounded so that the whole takes as long as it should.
     instants = np.round(100.0 / rate * np.arange(len(packed) + 1)).astype(int)
     stream = io.BytesIO()
