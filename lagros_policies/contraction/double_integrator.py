@@ -96,19 +96,6 @@ class AxisMetric:
         """Return lambda_max(M) lambda_max(C W C') with C = [1, 0], of the position's tube."""
         return float(1.0 / np.linalg.eigvalsh(self.dual)[0])
 
-    def control_weight(self, gain: float = 1.0, slack: float = 1e-2) -> float:
-        """Return a nu for which the condition at will holds at the rate (1 - slack) alpha.
-
-        At alpha itself the condition is the limit of nu without bound.
-
-        Args:
-            gain: The axis' entry of B B'.
-            slack: Share of the rate that is given up, in (0, 1].
-        """
-        alpha, q, s = self.rate * (1.0 - slack), self.coupling, self.stiffness
-        room = -2.0 * (q + alpha)
-        return float((2.0 * alpha * s + (s + 2.0 * alpha * q) ** 2 / room) / (2.0 * gain))
-
 
 def stiffness_range(rate: float, period: float) -> tuple[float, float]:
     """Return between which stiffnesses W is positive definite [1/s^2].
