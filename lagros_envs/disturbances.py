@@ -17,12 +17,11 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from lagros_envs.arrays import FloatArray
+from lagros_envs.balls import INSIDE, into_ball, into_unit_ball, onto_unit_sphere
 from lagros_envs.checks import check_disturbance_bound, shown, suggestion
 from lagros_envs.options import real_numbers
 from lagros_envs.values import ByValue
 
-# Rounding must not carry a vector of norm one over the bound.
-INSIDE = 1.0 - 4.0 * np.finfo(np.float64).eps
 GUST_CORRELATION_TIME = 1.0  # [s]
 GUST_SPREAD = 0.6  # stationary norm (root mean square) as a share of the bound, before clipping
 SINUSOID_RATES = (0.5, 5.0)  # [rad/s]
@@ -55,40 +54,6 @@ class Situation:
 
 
 Feedback = Callable[[Situation], FloatArray]
-
-
-def _rays(vectors: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return largest entry, vector over it and norm of that, which can neither over- nor underflow.
-
-    Args:
-        vectors: Shape (..., n).
-
-    Returns:
-        Shapes (..., 1), (..., n) and (..., 1); ones in place of the norm of a zero vector.
-    """
-    largest = np.maximum.reduce(np.abs(vectors), axis=-1, keepdims=True)
-    rays: FloatArray = vectors / np.where(largest > 0.0, largest, 1.0)
-    # What linalg.norm does, without its overhead.
-    lengths = np.sqrt(np.add.reduce(rays * rays, axis=-1, keepdims=True))
-    return largest, rays, np.maximum(lengths, 1.0)
-
-
-def into_ball(vectors: FloatArray, radius: float) -> FloatArray:
-    """Shorten the vectors (..., n) that are longer than the radius to the radius."""
-    largest, rays, lengths = _rays(vectors)
-    limit = (INSIDE * radius) / lengths
-    return np.where(largest <= limit, vectors, rays * limit)
-
-
-def into_unit_ball(vectors: FloatArray) -> FloatArray:
-    """Shorten the vectors (..., n) that are longer than one to length one."""
-    return into_ball(vectors, 1.0)
-
-
-def onto_unit_sphere(vectors: FloatArray, fallback: FloatArray) -> FloatArray:
-    """Scale the vectors (..., n) to length one; where one is zero take the fallback."""
-    largest, rays, lengths = _rays(vectors)
-    return np.where(largest > 0.0, rays * (INSIDE / lengths), fallback)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from lagros_envs.conventions import (
     warned_after,
 )
 from lagros_envs.disturbances import Situation
-from lagros_envs.draw import Frame
+from lagros_envs.draw import Frame, Renderer
 from lagros_envs.dynamics.held import HeldStep, OnFloats
 from lagros_envs.numbers import functions
 from lagros_envs.of_task import Channels, OfTask
@@ -153,7 +153,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[Float32Array, Float32Array]):
         m = self.settings.system.control_dim
         self._apply = OnFloats(partial(of_task.applied, self.settings), a=m)
         self._begin = OnFloats(self._rules.begun, x=self._n, g=self._rules.given)
-        self._renderer: Any = None
+        self._renderer: Renderer | None = None
         self._started = False
         # An `Outcome`, as far as it is kept, as a plain tuple, which is several times faster.
         self._outcome: tuple[Any, ...] = ()
@@ -264,13 +264,12 @@ class TaskEnv(OfTask, Conforming, gym.Env[Float32Array, Float32Array]):
         check_started(self._started, "render()")
         if self._renderer is None:
             self._renderer = self.settings.renderer(self.render_mode, self.metadata["render_fps"])
-        scenario = self.scenario
         nominal = None if self.nominal is None else self.nominal[self._nominal_index()]
-        frame: NDArray[np.uint8] | None = self._renderer.draw(
+        return self._renderer.draw(
             Frame(
                 state=self.state,
-                goal=scenario.goal,
-                discs=scenario.discs,
+                goal=self.scenario.goal,
+                discs=self.scenario.discs,
                 tube_radius=self._now[1],
                 disturbance=self._push,
                 disturbance_bound=self.disturbance.bound,
@@ -278,7 +277,6 @@ class TaskEnv(OfTask, Conforming, gym.Env[Float32Array, Float32Array]):
                 time=self.time,
             )
         )
-        return frame
 
     def close(self) -> None:
         """Release the window."""

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from lagros_envs.arrays import FloatArray, IntArray
+from lagros_envs.balls import INSIDE
 from lagros_envs.disturbances import (
     GUST_CORRELATION_TIME,
     GUST_SPREAD,
-    INSIDE,
     SINUSOID_RATES,
     Disturbance,
 )

@@ -110,7 +110,6 @@ def test_a_task_is_named_in_its_folder_only(path):
     assert not found
 
 
-@pytest.mark.xfail(reason="the move is under way", strict=False)
 @pytest.mark.parametrize("path", FILES, ids=place)
 def test_a_module_can_be_read_at_one_sitting(path):
     assert len(path.read_text(encoding="utf-8").splitlines()) <= LONGEST

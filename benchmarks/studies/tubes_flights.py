@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.worst_case.search import SearchSettings, search
-from lagros_envs.disturbances import Disturbance, into_unit_ball, onto_unit_sphere
+from lagros_envs.balls import into_unit_ball, onto_unit_sphere
+from lagros_envs.disturbances import Disturbance
 from lagros_envs.dynamics import hold_step, vector_field
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.tasks.cartpole import task

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from lagros_benchmarks.tasks.spacecraft.plane import worst_plane_pushes
 from lagros_benchmarks.worst_case.optimisers import make_search
 from lagros_benchmarks.worst_case.seeds import ATTACK
-from lagros_envs.disturbances import Disturbance, onto_unit_sphere
+from lagros_envs.balls import onto_unit_sphere
+from lagros_envs.disturbances import Disturbance
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv

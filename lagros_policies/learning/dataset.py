@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.balls import into_unit_ball
 from lagros_envs.checks import (
     check_disturbance_bound,
     check_fields,
@@ -24,7 +25,7 @@ from lagros_envs.checks import (
     check_seed,
     check_whole,
 )
-from lagros_envs.disturbances import OPEN_LOOP, into_unit_ball
+from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.task import Scenario, Task

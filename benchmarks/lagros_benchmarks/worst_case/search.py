@@ -16,8 +16,8 @@ import numpy as np
 from lagros_benchmarks.worst_case.optimisers import OPTIMISERS, make_search
 from lagros_benchmarks.worst_case.sequences import PARAMETRISATIONS
 from lagros_envs.arrays import FloatArray, IntArray
+from lagros_envs.balls import into_unit_ball, onto_unit_sphere
 from lagros_envs.checks import check_fields, check_name, check_whole
-from lagros_envs.disturbances import into_unit_ball, onto_unit_sphere
 
 MOST = 10**9  # of all that is counted
 METHODS = (*OPTIMISERS, "gradient", "hybrid")

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from lagros_envs.arrays import FloatArray
-from lagros_envs.disturbances import Situation, into_unit_ball, onto_unit_sphere
+from lagros_envs.balls import into_unit_ball, onto_unit_sphere
+from lagros_envs.disturbances import Situation
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from lagros_benchmarks.worst_case.replay import Outcome
 from lagros_benchmarks.worst_case.search import Found, search
 from lagros_benchmarks.worst_case.sequences import Replay
 from lagros_envs.arrays import FloatArray, IntArray
-from lagros_envs.disturbances import onto_unit_sphere
+from lagros_envs.balls import onto_unit_sphere
 from lagros_envs.registry import find_task
 from lagros_envs.task import LARGEST_DISTANCE, Task
 from lagros_policies.contraction import ContractionMetric

@@ -16,7 +16,8 @@ from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, make_worlds
 from lagros_benchmarks.worst_case.goals import GOALS
 from lagros_envs.arrays import FloatArray
-from lagros_envs.disturbances import Situation, onto_unit_sphere
+from lagros_envs.balls import onto_unit_sphere
+from lagros_envs.disturbances import Situation
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
