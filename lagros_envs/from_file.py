@@ -73,7 +73,12 @@ class _Finder:
             place = Path(bytes.fromhex(own.rpartition("_")[2]).decode())
         except ValueError:
             return None
-        return spec_from_file_location(name, place) if place.is_file() else None
+        if not place.is_file():
+            return None
+        if str(place.parent) not in sys.path:
+            # Last, so that what the file imports from beside it hides nothing.
+            sys.path.append(str(place.parent))
+        return spec_from_file_location(name, place)
 
 
 if not any(isinstance(finder, type) and finder.__name__ == "_Finder" for finder in sys.meta_path):

@@ -24,7 +24,7 @@ from lagros_benchmarks.run.runner import kept_in, run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings
 from lagros_benchmarks.run.single import SingleExperiment
 from lagros_benchmarks.tasks.spacecraft.episodes import AgentRecord, Flight
-from tests.benchmarks import fakes, killed_runs
+from tests.benchmarks import fakes, killed_runs, toys
 
 TIMES = ("timed_counters", "step_times", "deadline_misses", "steps", "batches", "plans")
 
@@ -282,6 +282,24 @@ def test_the_key_changes_with_all_that_a_result_depends_on(tmp_path, monkeypatch
     different.append(key())
     assert len({first, *different}) == 1 + len(different)
     assert key(jobs=2) == key(jobs=3)
+
+
+def test_the_key_changes_with_a_task_of_ones_own_and_what_it_needs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = Path(toys.__file__).read_text(encoding="utf-8")
+    (tmp_path / "coin.py").write_text(text.replace('"slider", "Slider"', '"coin", "Coin"'))
+    settings = BenchmarkSettings.for_task("./coin.py", policies=("lqr",))
+    folder = tmp_path / "runs" / "reproduce-coin"
+    folder.mkdir(parents=True)
+    keys = [fingerprint(settings, Toolbox())]
+    for name in ("results.json", "lagros_checkpoint.safetensors"):
+        (folder / name).write_text("of no policy")
+    assert fingerprint(settings, Toolbox()) == keys[0]
+    needed = (folder / "metric.json", folder / "coin_lagros.safetensors", tmp_path / "physics.py")
+    for path in (*needed, tmp_path / "coin.py"):
+        path.write_text(path.read_text() + "\n" if path.exists() else "1")
+        keys.append(fingerprint(settings, Toolbox()))
+    assert len(set(keys)) == 5
 
 
 # The command

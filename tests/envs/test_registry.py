@@ -3,6 +3,7 @@
 import os
 import pickle
 import shlex
+import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -146,6 +147,18 @@ assert type(task).__name__ == "Puck" and task == env.settings
 print(env.reset(seed=3)[0].tolist())
 """
     assert run_python(script).strip() == str(env.reset(seed=3)[0].tolist())
+
+
+def test_what_lies_beside_the_file_of_a_task_can_be_imported(tmp_path, run_python):
+    text = FILE.read_text().replace('"puck", "Puck"', '"lump", "Lump"')
+    (tmp_path / "lump.py").write_text("import beside_the_lump\n" + text)
+    (tmp_path / "beside_the_lump.py").write_text("")
+    task = find_task(str(tmp_path / "lump.py"))
+    (tmp_path / "sent").write_bytes(pickle.dumps(task))
+    script = f"import pickle\nprint(pickle.load(open({str(tmp_path / 'sent')!r}, 'rb')).name)"
+    assert run_python(script).strip() == "lump"
+    assert sys.path[-1] == str(tmp_path)
+    sys.path.remove(str(tmp_path))
 
 
 def _first(task, seed):

@@ -6,7 +6,7 @@ import json
 
 from lagros_envs.task import Described
 from lagros_policies.contraction.statement import Statement
-from lagros_policies.room import shipped_file
+from lagros_policies.room import found_file
 
 # Policies that track with u* itself.
 _EXACT = ("tube-mpc", "centralized")
@@ -19,7 +19,7 @@ def recorded_error(task: Described, policy: str) -> float:
         FileNotFoundError: The network has no record.
         ValueError: The record holds no such figure.
     """
-    path = shipped_file(task, f"{policy}.json")
+    path = found_file(task, f"{policy}.json")
     try:
         return float(json.loads(path.read_text())["learning_error"]["maximum"])
     except (KeyError, TypeError, ValueError) as error:

@@ -55,11 +55,21 @@ def fingerprint(settings: BenchmarkSettings, toolbox: Toolbox) -> str:
 
 
 def _task_files(task: Any) -> list[Path]:
-    """Return the file in which a task is described, and its weights."""
-    described = inspect.getsourcefile(type(task))
-    own = [] if described is None else [Path(described)]
+    """Return the files in which a task and its system are described, and its weights."""
     folder = weights_folder(task)
-    return own + sorted([folder / "metric.json", *folder.glob(f"{task.name}_*")])
+    weights = sorted([folder / "metric.json", *folder.glob(f"{task.name}_*")])
+    kinds = (type(task), type(getattr(task, "system", task)))
+    return [*(path for kind in kinds for path in _python_of(kind)), *weights]
+
+
+def _python_of(kind: type) -> list[Path]:
+    """Return the file of a class and the modules beside it, which it may import."""
+    try:
+        path = Path(inspect.getsourcefile(kind) or "")
+    except (OSError, TypeError):  # such as one of a notebook
+        return []
+    modules = [path, *path.parent.glob("*.py")]
+    return sorted({*modules, *_packages_beside(path.parent, modules)})
 
 
 def _named_files(value: Any) -> Iterator[tuple[str, list[Path]]]:

@@ -41,6 +41,7 @@ from lagros_policies.learning.train import TrainingSettings, fit, learning_error
 from lagros_policies.trained_for import training_of, weights_record
 
 _SHARDS = 20  # pieces of work, where they divide plans and samples
+_LEAST = 10  # plans in each
 # What metric, plans and networks ask of a task besides its settings, equation and scenarios.
 _ASKED = (
     *("metric", "feedback", "position", "body_radius", "most_discs", "margin"),
@@ -169,7 +170,8 @@ class ReproduceSettings:
 
 
 def _data(how: Learning, plans: int, samples: int, seed: int) -> ExpertDataSettings:
-    shards = math.gcd(_SHARDS, plans, samples)
+    # A piece without any plan is an error: where there are few, they are in few pieces.
+    shards = math.gcd(max(1, min(_SHARDS, plans // _LEAST)), plans, samples)
     return ExpertDataSettings(
         plans, samples, shards, disturbance_bound=how.disturbance_bound, seed=seed
     )
