@@ -56,7 +56,8 @@ def called(task: Described) -> str:
         return quote(_CALLED[task.name])
     module = type(task).__module__
     file = getattr(sys.modules.get(module), "__file__", None)
-    if file is not None and (module == "__main__" or module.startswith("lagros_envs.from_file.")):
+    own = module == "__main__" or module.startswith("lagros_envs.from_file.")
+    if own and file is not None and os.path.isfile(file):
         module = file
     return quote(f"{module}:{type(task).__qualname__}")
 

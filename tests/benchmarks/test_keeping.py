@@ -24,6 +24,7 @@ from lagros_benchmarks.run.runner import kept_in, run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings
 from lagros_benchmarks.run.single import SingleExperiment
 from lagros_benchmarks.tasks.spacecraft.episodes import AgentRecord, Flight
+from lagros_envs import registry
 from tests.benchmarks import fakes, killed_runs, toys
 
 TIMES = ("timed_counters", "step_times", "deadline_misses", "steps", "batches", "plans")
@@ -300,6 +301,19 @@ def test_the_key_changes_with_a_task_of_ones_own_and_what_it_needs(tmp_path, mon
         path.write_text(path.read_text() + "\n" if path.exists() else "1")
         keys.append(fingerprint(settings, Toolbox()))
     assert len(set(keys)) == 5
+
+
+def test_the_key_changes_with_the_equation_of_a_task_that_has_no_file(monkeypatch):
+    """Such as one of a notebook."""
+    monkeypatch.setattr("lagros_benchmarks.run.fingerprints.inspect.getsourcefile", lambda _: None)
+    task = type("Slide", (toys.Slide,), {"name": "in-hand", "title": "InHand"})()
+    monkeypatch.setitem(registry._FOUND, "in-hand", task)
+    settings = BenchmarkSettings.for_task("in-hand", policies=("lqr",))
+    first = fingerprint(settings, Toolbox())
+    monkeypatch.setattr(
+        toys.Puck, "derivative", lambda _, x, u, functions: (x[2], x[3], u[0] - 0.1 * x[2], u[1])
+    )
+    assert fingerprint(settings, Toolbox()) != first
 
 
 # The command

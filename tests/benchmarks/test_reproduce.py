@@ -216,10 +216,8 @@ import numpy as np
 from lagros_envs.task import Learning, MetricDesign, Scenario, Task
 
 
-@dataclass(frozen=True)
 class Pendulum:
-    state_dim: int = 2
-    control_dim: int = 1
+    state_dim, control_dim = 2, 1
 
     def derivative(self, state, control, functions):
         return state[1], functions.sin(state[0]) - 0.2 * state[1] + control[0]

@@ -7,16 +7,22 @@ import hashlib
 import importlib.util
 import inspect
 import json
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lagros_benchmarks.run.library import Toolbox
 from lagros_benchmarks.run.settings import BenchmarkSettings
 from lagros_benchmarks.run.surroundings import machine, threads, versions
+from lagros_envs.dynamics.straight_line import statements, straight_line
+from lagros_envs.numbers import functions
+from lagros_envs.task import Task
 from lagros_policies.naming import is_file, model_file, user_class
 from lagros_policies.room import weights_folder
 
@@ -28,6 +34,12 @@ _BESIDE = {
 }
 # What changes no result; whether the work is done in parallel does, for it decides what is timed.
 _FREE = ("jobs", "backend")
+# What metric, plans and networks ask of a task besides its settings, equation and scenarios.
+_ASKED = (
+    *("metric", "feedback", "position", "body_radius", "most_discs", "margin"),
+    *("state_low", "state_high", "state_scale"),
+    *("control_low", "control_high", "control_scale", "control_centre", "control_spread"),
+)
 
 
 def fingerprint(settings: BenchmarkSettings, toolbox: Toolbox) -> str:
@@ -38,12 +50,13 @@ def fingerprint(settings: BenchmarkSettings, toolbox: Toolbox) -> str:
     product may depend on each.
     """
     record = {name: value for name, value in asdict(settings).items() if name not in _FREE}
-    made_by = machine()
+    made_by, task = machine(), settings.description
     depends = {
         "settings": record,
         "parallel": settings.backend.in_parallel(settings.jobs),
         "files": {text: _digest(files) for text, files in _named_files(record)},
-        "task": _digest(_task_files(settings.description)),
+        "task": _digest(_task_files(task)),
+        "described": described(task) if isinstance(task, Task) else None,
         "code": _own_code(),
         "toolbox": [_origin(value) for value in vars(toolbox).values()],
         "versions": versions(),
@@ -52,6 +65,22 @@ def fingerprint(settings: BenchmarkSettings, toolbox: Toolbox) -> str:
     }
     text = json.dumps(depends, sort_keys=True, default=repr)
     return hashlib.sha256(text.encode(errors="backslashreplace")).hexdigest()
+
+
+def described(task: Task) -> dict[str, Any]:
+    """Return what of a task its author may change: equation, limits, scenarios."""
+    n, m = task.system.state_dim, task.system.control_dim
+
+    def equation(numbers: Sequence[Any]) -> Sequence[Any]:
+        return task.system.derivative(numbers[:n], numbers[n:], functions)
+
+    names = [f"{kind}{index}" for kind, count in (("x", n), ("u", m)) for index in range(count)]
+    lines, rates = statements(straight_line(equation, names))
+    said = {name: repr(getattr(task, name)) for name in _ASKED}
+    first = repr(task.sample(np.random.default_rng(0)))
+    # Where an object without a text of its own lies says nothing of it.
+    settings = re.sub(r" at 0x[0-9a-f]+", "", repr(task))
+    return {"settings": settings, "equation": [*lines, *rates], "first": first, **said}
 
 
 def _task_files(task: Any) -> list[Path]:

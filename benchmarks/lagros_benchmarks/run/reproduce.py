@@ -19,13 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_benchmarks.run.experiment import Progress
+from lagros_benchmarks.run.fingerprints import described
 from lagros_benchmarks.run.reproduction import Say, made_before
 from lagros_benchmarks.run.settings import BenchmarkSettings
 from lagros_envs.arrays import Float32Array, IntArray
 from lagros_envs.checks import check_fields
-from lagros_envs.dynamics.straight_line import statements, straight_line
 from lagros_envs.files import write_atomic
-from lagros_envs.numbers import functions
 from lagros_envs.registry import find_task, task_names
 from lagros_envs.task import Learning, Task
 from lagros_envs.tasks import SHIPPED
@@ -42,12 +41,6 @@ from lagros_policies.trained_for import training_of, weights_record
 
 _SHARDS = 20  # pieces of work, where they divide plans and samples
 _LEAST = 10  # plans in each
-# What metric, plans and networks ask of a task besides its settings, equation and scenarios.
-_ASKED = (
-    *("metric", "feedback", "position", "body_radius", "most_discs", "margin"),
-    *("state_low", "state_high", "state_scale"),
-    *("control_low", "control_high", "control_scale", "control_centre", "control_spread"),
-)
 _POLICIES = ("learned", "tube-mpc", "lagros", "lqr")
 
 
@@ -141,7 +134,7 @@ class ReproduceSettings:
     def make(self, folder: Path, progress: Progress, say: Say) -> None:
         """Make metric, data and networks; see `reproduction.reproduce`."""
         if self.description.name not in SHIPPED:
-            claim(folder / "described.json", _described(self.description), "a run")
+            claim(folder / "described.json", described(self.description), "a run")
         _Making(self, folder, progress, say).run()
 
     def benchmark(self, folder: Path | None) -> BenchmarkSettings:
@@ -175,20 +168,6 @@ def _data(how: Learning, plans: int, samples: int, seed: int) -> ExpertDataSetti
     return ExpertDataSettings(
         plans, samples, shards, disturbance_bound=how.disturbance_bound, seed=seed
     )
-
-
-def _described(task: Task) -> dict[str, Any]:
-    """Return what a run depends on that its author may change: equation, limits, scenarios."""
-    n, m = task.system.state_dim, task.system.control_dim
-
-    def equation(numbers: Sequence[Any]) -> Sequence[Any]:
-        return task.system.derivative(numbers[:n], numbers[n:], functions)
-
-    names = [f"{kind}{index}" for kind, count in (("x", n), ("u", m)) for index in range(count)]
-    lines, rates = statements(straight_line(equation, names))
-    said = {name: repr(getattr(task, name)) for name in _ASKED}
-    first = task.sample(np.random.default_rng(0))
-    return {"settings": repr(task), "equation": [*lines, *rates], "first": repr(first), **said}
 
 
 def _weights(folder: Path, task: Task, name: str) -> Path:
