@@ -40,6 +40,8 @@ Matrices = Callable[[Triple], Series]
 
 # Cells along a coordinate in which the matrices are curved, between two cuts.
 _FIRST = 4
+# Each is looked at before the time of a search begins to count.
+_MOST_PIECES = 10_000
 # Corners at which a failure is looked for, the worst first.
 _LOOKED_AT = 20
 
@@ -79,6 +81,11 @@ class BoxCondition:
         self.counts = np.ones(len(free), dtype=int)
         self.moving = np.arange(len(free))
         whole, moving = self.where.cells(self.counts.tolist()), []
+        if len(whole.lower) > _MOST_PIECES:
+            raise ValueError(
+                f"the box of {len(free)} coordinates is {len(whole.lower)} pieces before a search "
+                f"cuts any, more than {_MOST_PIECES}: there is no proof for so many states"
+            )
         for index in np.flatnonzero(lower < upper):
             try:
                 parts = self._along(whole, int(index), 2).parts

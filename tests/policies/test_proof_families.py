@@ -397,3 +397,16 @@ def test_no_proof_reaches_over_a_bend_and_one_beside_it_is_found():
         metric = Metric(weights, 0.3, 50.0, 9.0, np.ones(2), box)
         found = prove_contraction(Boat(), metric, box, most_boxes=2000)
         assert (found.proved, found.refuted) == (proved, False)
+
+
+def test_a_box_of_too_many_coordinates_is_refused_before_any_is_cut():
+    class Chain:
+        state_dim, control_dim = 12, 1
+
+        def derivative(self, x, u, functions):
+            return [*(after**2 for after in x[1:]), u[0]]
+
+    box = BoxRegion((-1.0,) * 12, (1.0,) * 12, (0.1,) * 12, (-1.0,), (1.0,))
+    metric = Metric(np.eye(12)[None], 0.3, 50.0, 9.0, np.ones(12), box)
+    with pytest.raises(ValueError, match=r"pieces before a search cuts any, more than 10000"):
+        prove_contraction(Chain(), metric, box)
