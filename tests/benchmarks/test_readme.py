@@ -58,7 +58,7 @@ def test_the_readers_own_system_flies(monkeypatch: pytest.MonkeyPatch, tmp_path:
     command = ["bench", "./slide.py", "--policies", "lqr,random", "--episodes", "3"]
     result = CliRunner().invoke(cli.app, command)
     assert result.exit_code == 0
-    row = next(line.split() for line in result.output.splitlines() if line.startswith(" lqr"))
+    row = next(line.split() for line in result.output.splitlines() if line.startswith("lqr"))
     assert row[1] == "100.0"
 
 
