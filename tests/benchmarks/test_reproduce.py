@@ -208,7 +208,7 @@ def test_what_is_learned_from_a_network_has_sane_labels_and_nobody_at_rest():
     )
 
 
-SWING = """
+SWAY = """
 from dataclasses import dataclass
 
 import numpy as np
@@ -224,10 +224,10 @@ class Pendulum:
 
 
 @dataclass(frozen=True)
-class Swing(Task):
+class Sway(Task):
     system: Pendulum = Pendulum()
     time_limit: float = 2.0
-    name, title = "swing", "Swing"
+    name, title = "sway", "Sway"
     control_scale = (9.0,)
     metric = MetricDesign((-1.0, -2.0), (1.0, 2.0), (0.3, 0.3), (-9.0,), (9.0,))
     learning = Learning()
@@ -241,12 +241,12 @@ def test_a_task_of_ones_own_that_has_changed_does_not_go_on_with_a_run(tmp_path,
     """Whatever of it has changed; what it looks like, and how it is called, may."""
     monkeypatch.setattr("lagros_benchmarks.run.reproduce._Making.run", lambda making: None)
     monkeypatch.chdir(tmp_path)
-    path = tmp_path / "swing.py"
-    path.write_text(SWING)
-    reproduce(tmp_path / "run", ReproduceSettings("./swing.py", jobs=1))
-    path.write_text(SWING + "\n    def outline(self, state):\n        return ()\n")
+    path = tmp_path / "sway.py"
+    path.write_text(SWAY)
+    reproduce(tmp_path / "run", ReproduceSettings("./sway.py", jobs=1))
+    path.write_text(SWAY + "\n    def outline(self, state):\n        return ()\n")
     os.utime(path, ns=(1, 1))
-    reproduce(tmp_path / "run", ReproduceSettings(f"{path}:Swing", jobs=1))
+    reproduce(tmp_path / "run", ReproduceSettings(f"{path}:Sway", jobs=1))
     changes = [
         ("0.2 * state[1]", "0.3 * state[1]"),
         ("(9.0,)\n    metric", "(9.0,)\n    control_high = (9.0,)\n    metric"),
@@ -255,7 +255,7 @@ def test_a_task_of_ones_own_that_has_changed_does_not_go_on_with_a_run(tmp_path,
         ("time_limit: float = 2.0", "time_limit: float = 3.0"),
     ]
     for number, change in enumerate(changes, 2):
-        path.write_text(SWING.replace(*change))
+        path.write_text(SWAY.replace(*change))
         os.utime(path, ns=(number, number))
         with pytest.raises(ValueError, match="holds a run of other settings; name another folder"):
-            reproduce(tmp_path / "run", ReproduceSettings("swing.py", jobs=1))
+            reproduce(tmp_path / "run", ReproduceSettings("sway.py", jobs=1))
