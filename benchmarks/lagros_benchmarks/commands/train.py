@@ -148,7 +148,7 @@ def _train_one(
     Console(highlight=False).print(table)
     name = run.algorithm.name if residual is None else "residual"
     home = shipped_file(find_task(run.task), f"{name}.safetensors")
-    typer.echo(f"copied to {home}, they fly as the policy {name!r}")
+    typer.echo(f"copy them to {home}, and they fly as the policy {name!r}")
     return record
 
 
