@@ -16,6 +16,8 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal, TypeGuard, Union, get_args, get_origin, get_type_hints
 
+from lagros_envs.values import use_plain_numbers
+
 # Control steps of an episode, whose states are kept.
 MOST_STEPS = 1_000_000
 # Of d_bar: under a thousandth of it nothing flies, and squares of the states stay numbers.
@@ -89,6 +91,25 @@ def check_at_most(name: str, value: float, most: float, otherwise: str = "") -> 
         ValueError: It is no number, more than `most`, or NaN.
     """
     _check(is_number(value) and value <= most, name, value, f"at most {most:g}", otherwise)
+
+
+def check_constants(system: Any) -> None:
+    """Check the constants of a body while it is built: positive, and with bounded inverses.
+
+    Args:
+        system: An instance of a frozen dataclass of numbers; NumPy's become Python's.
+
+    Raises:
+        ValueError: A constant is none of these; the message names it.
+    """
+    check_fields(system)
+    use_plain_numbers(system)
+    for item in fields(system):
+        value = getattr(system, item.name)
+        check_positive(item.name, value)
+        # Less, and what is divided by it has no bound.
+        check_at_least(item.name, value, 1.0 / LARGEST)
+        check_at_most(item.name, value, LARGEST)
 
 
 def check_fields(

@@ -52,7 +52,8 @@ def settings() -> Iterator[type]:
 
 def checks_fields(kind: type) -> bool:
     ours = (base for base in kind.__mro__ if base.__module__.startswith("lagros"))
-    return any("check_fields(" in inspect.getsource(base) for base in ours)
+    calls = ("check_fields(", "check_constants(")
+    return any(call in inspect.getsource(base) for base in ours for call in calls)
 
 
 def fields(kind: type) -> tuple[Any, ...]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
-from lagros_envs.checks import LARGEST, check_at_least, check_at_most, check_fields, check_positive
+from lagros_envs.checks import check_constants
 from lagros_envs.dynamics.system import Components
-from lagros_envs.values import use_plain_numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,13 +32,7 @@ class Pvtol:
     gravity: float = 9.81
 
     def __post_init__(self) -> None:
-        check_fields(self)
-        use_plain_numbers(self)
-        for field in fields(self):
-            value = getattr(self, field.name)
-            check_positive(field.name, value)
-            check_at_least(field.name, value, 1.0 / LARGEST)
-            check_at_most(field.name, value, LARGEST)
+        check_constants(self)
 
     @property
     def state_dim(self) -> int:

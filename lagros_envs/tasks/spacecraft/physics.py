@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
-from lagros_envs.checks import (
-    LARGEST,
-    check_at_least,
-    check_at_most,
-    check_fields,
-    check_positive,
-)
+from lagros_envs.checks import check_constants
 from lagros_envs.dynamics.system import Components
-from lagros_envs.values import use_plain_numbers
 
 X, Y, HEADING, VELOCITY_X, VELOCITY_Y, SPIN = range(6)
 
@@ -42,14 +35,7 @@ class Spacecraft:
     side_arm: float = 1.0
 
     def __post_init__(self) -> None:
-        check_fields(self)
-        use_plain_numbers(self)
-        for field in fields(self):
-            value = getattr(self, field.name)
-            check_positive(field.name, value)
-            # Less, and what is divided by it has no bound.
-            check_at_least(field.name, value, 1.0 / LARGEST)
-            check_at_most(field.name, value, LARGEST)
+        check_constants(self)
 
     @property
     def state_dim(self) -> int:
