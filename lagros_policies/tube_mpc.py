@@ -1,4 +1,4 @@
-"""Policy (b): online tube MPC. Plan, re-plan while the horizon shrinks, track the plan with u*."""
+"""Policy (b): online tube MPC. Plan, plan again when something calls for it, track with u*."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
 from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
-from lagros_envs.checks import check_above, check_whole, shown
+from lagros_envs.checks import check_above, check_not_negative, check_whole, shown
 from lagros_envs.task import Task
 from lagros_policies.contraction import ContractionMetric, load_metric
 from lagros_policies.expert import Expert, TrackedPlans
@@ -56,16 +57,22 @@ class TubeMpcState:
 class TubeMpcPolicy(BasePolicy):
     """Online tube MPC with the CV-STEM control u* around the plan.
 
-    The plan is renewed from the *nominal* state x_d(t), not from the measured one: the tube of
-    Theorem 1 surrounds one continuous target trajectory, and u* deals with the error. A re-plan
-    follows a goal or discs that move; without that it confirms the plan. If a plan fails or comes
-    late the last one stays in force; before there is any, a late plan is used (the system waits)
-    and a failed one means the reference control for this step. All of it is counted.
+    A plan is made when there is none and when the goal or the discs have moved, over the horizon
+    that is left: the rest of a plan of least effort is the plan of least effort from x_d(t), so
+    that asking at every step only confirms it. It begins at the *nominal* state x_d(t), not at the
+    measured one: the tube of Theorem 1 surrounds one continuous target trajectory, and u* deals
+    with the error. If a plan fails or comes late the last one stays in force; before there is any,
+    a late plan is used (the system waits) and a failed one means the reference control for this
+    step. All of it is counted.
+
+    Attributes:
+        keeps_plan: Whether the first plan stays while goal and discs do, so that the flight is that
+            of u* around it.
 
     Args:
         settings: The task; None for the paper's.
         metric: The contraction metric, or its file; the task's own if left out.
-        replan_every: Control steps between plans.
+        replan_every: Control steps between plans that nothing calls for; None for none of them.
         deadline: Delta t_max, after which a plan is late [s]; None for the control period.
         clock: Source of the time, for tests [s].
         allow_other_settings: Track with the task's own metric also where the system is another than
@@ -79,18 +86,20 @@ class TubeMpcPolicy(BasePolicy):
 
     name = "tube-mpc"
     restricted = True  # `policy.make` tells it whether other settings are allowed
+    keeps_plan: ClassVar[bool] = True
 
     def __init__(
         self,
         settings: Task | None = None,
         metric: ContractionMetric | str | Path | None = None,
-        replan_every: int = 1,
+        replan_every: int | None = None,
         deadline: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
         allow_other_settings: bool = False,
     ) -> None:
         self.settings = task = task_of(settings)
-        check_whole("replan_every", replan_every)
+        if replan_every is not None:
+            check_whole("replan_every", replan_every)
         deadline = task.control_period if deadline is None else deadline
         check_above("deadline", deadline, 0)
         if metric is None:
@@ -162,7 +171,7 @@ class TubeMpcPolicy(BasePolicy):
         step = min(step, task.steps - 1)
         asked = np.concatenate([row[layout.goal], row[layout.discs]])
         moved = not np.array_equal(asked, memory.asked)
-        if memory.plan is None or moved or step % self.replan_every == 0:
+        if memory.plan is None or moved or self._due(step):
             self._renew(row, asked, step, memory)
         if memory.tracked is None:
             return np.array(task.control_centre, np.float64)
@@ -170,6 +179,10 @@ class TubeMpcPolicy(BasePolicy):
         wanted = self.expert.wanted(memory.tracked, np.zeros(1, int), np.full(1, step), state)
         control: FloatArray = wanted[0]
         return control
+
+    def _due(self, step: int) -> bool:
+        """Whether a plan is to be made at a step for no other reason than the time."""
+        return self.replan_every is not None and step % self.replan_every == 0
 
     def _applied(self, control: FloatArray, memory: TubeMpcState) -> FloatArray:
         """Return what the bounds leave of a control (m,), and count where they take some."""
@@ -180,10 +193,7 @@ class TubeMpcPolicy(BasePolicy):
 
     def _renew(self, row: FloatArray, asked: FloatArray, step: int, memory: TubeMpcState) -> None:
         plan, layout = memory.plan, self._layout
-        if plan is None:
-            start = row[layout.state] if step else row[layout.initial_state]
-        else:
-            start = plan.states[step - (self.settings.steps - plan.horizon)]
+        start = self._start(row, step, plan)
         begun = self._clock()
         renewed = self.planner.plan(start, row[layout.goal], step, plan, layout.discs_of(row))
         late = self._clock() - begun > self.deadline
@@ -192,16 +202,74 @@ class TubeMpcPolicy(BasePolicy):
         memory.failed_plans += not renewed.solved
         if not renewed.solved or (late and plan is not None):
             return
-        memory.asked = asked
-        if plan is not None and self._confirms(renewed, plan):
+        moved = not np.array_equal(asked, memory.asked)
+        if plan is not None and not moved and self._confirms(renewed, plan):
             return
+        memory.asked = asked
         memory.plan = renewed
         memory.tracked = self.expert.track(renewed.states[None], renewed.controls[None], step)
+
+    def _start(self, row: FloatArray, step: int, plan: Trajectory | None) -> FloatArray:
+        """Return the state from which to plan, shape (n,)."""
+        if plan is None:
+            start: FloatArray = row[self._layout.state if step else self._layout.initial_state]
+            return start
+        nominal: FloatArray = plan.states[step - (self.settings.steps - plan.horizon)]
+        return nominal
 
     def _confirms(self, renewed: Trajectory, plan: Trajectory) -> bool:
         """Whether a re-plan is the rest of the plan in force, to the planner's accuracy."""
         change = np.abs(renewed.controls - plan.controls[-renewed.horizon :]) / self._unit
         return bool(np.max(change) <= _SAME_CONTROL)
+
+
+class ReplanningTubeMpcPolicy(TubeMpcPolicy):
+    """Tube MPC that plans anew from the *measured* state, as the horizon shrinks.
+
+    u* tracks the newest plan, whose error begins at zero. Where disturbance has pushed the body,
+    the plan goes with it: the error around the plan in force is that of a few steps, but the plans
+    wander, and no tube around the first of them is about such a flight. What would be is a bound on
+    where the sequence of plans can be driven to; there is none here. Near the time limit a plan
+    that has to end at the goal would ask for any control, so that the last one is made `last_plan`
+    before it and tracked to the end.
+
+    Args:
+        settings: The task; None for the paper's.
+        metric: The contraction metric, or its file; the task's own if left out.
+        replan_every: Control steps between plans.
+        last_plan: Time before the time limit after which no plan is made unless the goal or the
+            discs move [s].
+        planning: All else that `TubeMpcPolicy` takes.
+
+    Raises:
+        FileNotFoundError: The task's metric has not been made.
+        ValueError: As of `TubeMpcPolicy`, or `last_plan` is negative.
+    """
+
+    name = "tube-mpc:replan"
+    keeps_plan = False
+
+    def __init__(
+        self,
+        settings: Task | None = None,
+        metric: ContractionMetric | str | Path | None = None,
+        replan_every: int = 1,
+        last_plan: float = 1.0,
+        **planning: Any,
+    ) -> None:
+        check_not_negative("last_plan", last_plan)
+        super().__init__(settings, metric, replan_every, **planning)
+        self.last_plan = last_plan
+
+    def _due(self, step: int) -> bool:
+        left = (self.settings.steps - step) * self.settings.control_period
+        return super()._due(step) and left >= self.last_plan
+
+    def _start(self, row: FloatArray, step: int, plan: Trajectory | None) -> FloatArray:
+        return super()._start(row, step, None)
+
+    def _confirms(self, renewed: Trajectory, plan: Trajectory) -> bool:
+        return False
 
 
 def check_own_metric(task: Task, allow_other_settings: bool) -> None:

@@ -9,7 +9,7 @@ import pytest
 import lagros_envs  # noqa: F401  registers the environment
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.tasks.cartpole.planner import CartPolePlanner
-from lagros_policies.tube_mpc import TubeMpcPolicy
+from lagros_policies.tube_mpc import ReplanningTubeMpcPolicy, TubeMpcPolicy
 
 SHORT = CartPoleSettings(time_limit=3.0, goal_range=1.0)
 
@@ -82,11 +82,20 @@ def fly(policy, seed=0, bound=0.0, options=None, goals=None, steps=SHORT.steps):
     return np.stack(states), np.array(forces), memory, info
 
 
-def test_every_step_renews_the_plan_and_is_counted(build):
+def test_one_plan_serves_an_episode_whatever_the_disturbance(build):
     policy = build()
-    states, _, memory, _ = fly(policy)
+    states, _, memory, _ = fly(policy, bound=0.3)
     assert len(states) == 31
-    assert policy.counters(memory) == {"plans": 30, "failed_plans": 0, "late_plans": 0}
+    assert policy.counters(memory) == {"plans": 1, "failed_plans": 0, "late_plans": 0}
+
+
+def test_a_plan_at_every_step_only_confirms_the_first(build):
+    asked = build(replan_every=1)
+    states, forces, memory, _ = fly(asked, bound=0.3)
+    assert asked.counters(memory) == {"plans": 30, "failed_plans": 0, "late_plans": 0}
+    other_states, other_forces, *_ = fly(build(), bound=0.3)
+    assert states == pytest.approx(other_states, abs=0.05)
+    assert forces == pytest.approx(other_forces, abs=1.0)
 
 
 def test_plans_come_every_so_many_steps(build):
@@ -98,7 +107,7 @@ def test_plans_come_every_so_many_steps(build):
 def test_without_disturbance_it_follows_its_plan_to_the_goal(build):
     options = {"initial_state": [0.0, 0.6, 0.0, 0.0], "goal": 0.8}
     plan = CartPolePlanner(SHORT).plan(np.array([0.0, 0.6, 0.0, 0.0]), np.array([0.8, 0, 0, 0]))
-    for every in (1, 10):
+    for every in (1, 10, None):
         states, forces, _, info = fly(build(replan_every=every), options=options)
         assert np.abs(states - plan.states).max() < 0.02
         assert np.abs(forces - plan.controls[:, 0]).max() < 0.5
@@ -121,7 +130,7 @@ def test_under_disturbance_feedback_keeps_it_near_the_plan(build, oracle):
 
 def test_goal_that_moves_is_followed_at_once(build):
     options = {"initial_state": [0.0, 0.3, 0.0, 0.0], "goal": -0.5}
-    policy = build(replan_every=1000)
+    policy = build()
     states, _, memory, _ = fly(policy, options=options, goals=lambda k: -0.5 if k < 8 else 0.7)
     assert policy.counters(memory)["plans"] == 2
     assert states[-1] == pytest.approx([0.7, 0.0, 0.0, 0.0], abs=0.02)
@@ -157,7 +166,7 @@ def test_first_plan_is_used_however_late(build, clock):
 
 
 def test_failed_plan_is_counted_and_the_last_one_stays(build, spoil):
-    policy = build()
+    policy = build(replan_every=1)
     spoil.on = False
     _, memory = policy.predict(observe(0), None)
     first = memory[0].plan
@@ -170,7 +179,7 @@ def test_failed_plan_is_counted_and_the_last_one_stays(build, spoil):
 
 
 def test_failed_plan_for_a_new_goal_is_tried_again(build, spoil):
-    policy = build(replan_every=1000)
+    policy = build()
     spoil.on = False
     _, memory = policy.predict(observe(0), None)
     spoil.on = True
@@ -185,7 +194,7 @@ def test_failed_plan_for_a_new_goal_is_tried_again(build, spoil):
 
 
 def test_without_any_plan_there_is_no_force_until_one_succeeds(build, spoil):
-    policy = build(replan_every=1000)
+    policy = build()
     action, memory = policy.predict(observe(0), None)
     assert np.array_equal(action, [0.0])
     action, memory = policy.predict(observe(1), memory)
@@ -201,7 +210,7 @@ def test_without_any_plan_there_is_no_force_until_one_succeeds(build, spoil):
 
 
 def test_episode_that_flies_on_failures_still_ends_at_the_goal(build, spoil):
-    policy = build()
+    policy = build(replan_every=1)
     options = {"initial_state": [0.0, 0.6, 0.0, 0.0], "goal": 0.8}
     spoil.on = False
     calls = []
@@ -217,7 +226,7 @@ def test_episode_that_flies_on_failures_still_ends_at_the_goal(build, spoil):
 
 
 def test_only_the_row_that_starts_an_episode_forgets(build):
-    policy = build(replan_every=1000)
+    policy = build()
     rows = np.stack([observe(0), observe(0, goal=0.2), observe(0, goal=-0.3)])
     _, memory = policy.predict(rows, None, np.ones(3, bool))
     plans = [entry.plan for entry in memory]
@@ -249,3 +258,33 @@ def test_past_the_time_limit_there_is_still_a_force(build):
 def test_settings_out_of_range_are_refused(build, bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         build(**bad)
+
+
+def test_plans_from_the_measured_state_go_with_the_body(build, metric):
+    policy = ReplanningTubeMpcPolicy(SHORT, metric, deadline=1e9)
+    _, memory = policy.predict(observe(0), None)
+    for step, pushed in ((1, 0.3), (2, -0.2)):
+        nominal = memory[0].plan.states[1]
+        measured = np.float32(nominal + np.array([pushed, 0.0, 0.0, 0.0]))
+        action, memory = policy.predict(observe(step, measured), memory)
+        plan = memory[0].plan
+        assert plan.states[0] == pytest.approx(measured, abs=1e-6)
+        assert plan.states[-1] == pytest.approx([0.5, 0.0, 0.0, 0.0], abs=1e-6)
+        # The error around the newest plan is zero, so that its own control is applied.
+        assert 40.0 * action[0] == pytest.approx(plan.controls[0, 0], abs=1e-3)
+    assert policy.counters(memory)["plans"] == 3
+
+
+def test_near_the_time_limit_the_last_plan_from_the_measured_state_stays(metric):
+    policy = ReplanningTubeMpcPolicy(SHORT, metric, 2, last_plan=1.0, deadline=1e9)
+    _, _, memory, info = fly(policy, bound=0.1)
+    # At 0, 0.2, ..., 2.0 s of 3 s.
+    assert policy.counters(memory)["plans"] == 11
+    assert info["inside_tube"]
+
+
+def test_without_disturbance_it_does_not_matter_from_where_it_plans(build, metric):
+    options = {"initial_state": [0.0, 0.5, 0.0, 0.0], "goal": 0.8}
+    kept, *_ = fly(build(), options=options)
+    anew, *_ = fly(ReplanningTubeMpcPolicy(SHORT, metric, 5, deadline=1e9), options=options)
+    assert anew == pytest.approx(kept, abs=0.02)

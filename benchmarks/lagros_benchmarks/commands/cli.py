@@ -115,7 +115,11 @@ def bench(
         int, typer.Option(help="Episodes of that pass, which worlds of agents always have.")
     ] = 10,
     replan_every: Annotated[
-        int | None, typer.Option(help="One body: control steps between the plans of tube-mpc, 1.")
+        int | None,
+        typer.Option(
+            help="One body: control steps between the plans of tube-mpc; if left out it plans "
+            "again where goal or discs have moved."
+        ),
     ] = None,
     json: Annotated[
         Path | None, file_option("All figures, one object per policy and condition.")
@@ -170,10 +174,15 @@ def bench(
             refuse_options(["--scene-world"], "no --scene is asked for")
         if disturbance.strip() == "none":
             refuse_options(["--bound"], "no disturbance has a bound")
+        planned = [
+            name
+            for name in named or described.defaults.policies
+            if name.partition(":")[0] == "tube-mpc"
+        ]
         if replan_every is not None:
             if described.most_agents > 1:
                 raise ValueError(f"--replan-every is for one body; leave it out for {task}")
-            if "tube-mpc" not in (named or described.defaults.policies):
+            if not planned:
                 raise ValueError("--replan-every is for tube-mpc, which is none of --policies")
             check_whole("replan_every", replan_every, 1, described.steps)
         settings = BenchmarkSettings.for_task(
@@ -181,7 +190,7 @@ def bench(
             policies=listed_or_none(named, str, "--policies"),
             policy_settings=None
             if replan_every is None
-            else {"tube-mpc": {"replan_every": replan_every}},
+            else {name: {"replan_every": replan_every} for name in planned},
             episodes=episodes,
             seed=seed,
             disturbances=listed(disturbance, str, "--disturbance"),

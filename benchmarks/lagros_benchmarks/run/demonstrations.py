@@ -215,8 +215,8 @@ class SingleExpert(Expert):
         from lagros_policies.tube_mpc import TubeMpcPolicy
 
         self._task = env.settings
-        # A failed plan is asked for again at the next step, as policy (b) does.
-        self._policy = TubeMpcPolicy(env.settings, replan_every=self._task.steps, deadline=math.inf)
+        # A failed plan is asked for again at the next step.
+        self._policy = TubeMpcPolicy(env.settings, deadline=math.inf)
 
     def predict(
         self, observation: Float32Array, state: PolicyState = None, *rest: Any

@@ -166,11 +166,10 @@ class SingleBench:
         ClosedLoop(env, make_single_policy(name, env)).rehearse(f"policy {name!r}")
         # Another one flies: a policy may count its calls without being told.
         policy: Any = make_single_policy(name, env)
-        # One that remembers a plan and nothing else: u* around it stands in for it in a search.
+        # One that keeps its plan and nothing else: u* around it stands in for it in a search.
         # What a user derives from ours is another law.
-        self.tracks = isinstance(policy, TubeMpcPolicy) and type(policy).__module__.startswith(
-            "lagros_policies."
-        )
+        ours = type(policy).__module__.startswith("lagros_policies.")
+        self.tracks = ours and isinstance(policy, TubeMpcPolicy) and policy.keeps_plan
         self.policy = policy
         # One whose metric is a network is held against the tube of its own.
         self.expert = cast(Any, self.policy.expert if self.tracks else self._expert(say))
@@ -192,7 +191,7 @@ class SingleBench:
     def search(self, say: Callable[[str], None]) -> list[Found]:
         """Search the worst sequence of every episode."""
         say("searching")
-        # For tube MPC u* around its plan, which it confirms.
+        # For tube MPC u* around its plan, which it keeps.
         tracked = tracking_law(self.expert, self.episodes) if self.tracks else None
         target = SingleTarget(
             self.episodes,
