@@ -14,9 +14,9 @@ A system states dx/dt once, as a function of numbers. What is passed in decides 
 Every kind knows `+ - * /` with its own kind and with floats, the sign, integer powers and `abs`,
 and the functions of `lagros_envs.numbers.functions`: `sin`, `cos`, `tan`, `exp`, `sqrt`. Nothing
 else may be used in a `derivative`: no comparison and no branch on the state, no `min`, no `math` or
-`numpy` of its own. (The rules of a task, such as who has fallen, are for floats, arrays and
-`Recorded`, and may also compare, join comparisons by `&` and `|`, and choose by `where`, `minimum`
-and `maximum`.)
+`numpy` of its own. (The rules of a task, such as who has fallen, are for floats, arrays,
+`Interval` and `Recorded`, and may also compare, join comparisons by `&` and `|`, and choose by
+`where`, `minimum` and `maximum`.)
 """
 
 from lagros_envs.numbers import functions

@@ -202,6 +202,26 @@ class Interval:
         least = np.where(around, 0.0, np.minimum(first, second))
         return ordered(least, np.maximum(first, second))
 
+    def __lt__(self, other: Number) -> Truth:
+        """Return where it can be, and must be, less."""
+        low, high = ends(other)
+        return Truth(self.lower < high, self.upper < low)
+
+    def __le__(self, other: Number) -> Truth:
+        """Return where it can be, and must be, at most."""
+        low, high = ends(other)
+        return Truth(self.lower <= high, self.upper <= low)
+
+    def __gt__(self, other: Number) -> Truth:
+        """Return where it can be, and must be, more."""
+        low, high = ends(other)
+        return Truth(self.upper > low, self.lower > high)
+
+    def __ge__(self, other: Number) -> Truth:
+        """Return where it can be, and must be, at least."""
+        low, high = ends(other)
+        return Truth(self.upper >= low, self.lower >= high)
+
     def __pow__(self, exponent: int) -> Any:
         """Enclose integer powers: even ones are squares, odd ones increase."""
         if not isinstance(exponent, int | np.integer) or exponent < 3:
@@ -210,6 +230,56 @@ class Interval:
             return power(self, exponent // 2).square()
         low, high = (power(exact(end), exponent) for end in (self.lower, self.upper))
         return ordered(low.lower, high.upper)
+
+
+class Truth:
+    """What a comparison of intervals comes to, element by element; the rules of a task join them.
+
+    Attributes:
+        can: Whether it holds for some numbers of the intervals, or is not known to hold for none.
+        must: Whether it holds for all of them.
+    """
+
+    __slots__ = ("can", "must")
+
+    def __init__(self, can: Any, must: Any) -> None:
+        """Pair the two, arrays that broadcast."""
+        self.can: BoolArray = np.asarray(can, bool)
+        self.must: BoolArray = np.asarray(must, bool)
+
+    def __and__(self, other: Truth | bool) -> Truth:
+        """Return where both hold."""
+        can, must = _truth(other)
+        return Truth(self.can & can, self.must & must)
+
+    __rand__ = __and__
+
+    def __or__(self, other: Truth | bool) -> Truth:
+        """Return where at least one holds."""
+        can, must = _truth(other)
+        return Truth(self.can | can, self.must | must)
+
+    __ror__ = __or__
+
+    def where(self, yes: Number, no: Number) -> Interval:
+        """Enclose the choice between two numbers."""
+        (low, high), (other_low, other_high) = ends(yes), ends(no)
+        lower = np.where(self.can, low, np.inf)
+        upper = np.where(self.can, high, -np.inf)
+        lower = np.where(self.must, lower, np.minimum(lower, other_low))
+        return ordered(lower, np.where(self.must, upper, np.maximum(upper, other_high)))
+
+    def __bool__(self) -> bool:
+        """Refuse.
+
+        Raises:
+            TypeError: Always: intervals may do both.
+        """
+        raise TypeError("what intervals are compared by must not branch: use where, & and |")
+
+
+def _truth(value: Truth | bool) -> tuple[Any, Any]:
+    return (value.can, value.must) if isinstance(value, Truth) else (value, value)
 
 
 # What an interval works with itself; duals and series of intervals answer in its place.
@@ -274,6 +344,10 @@ def _monotone(low: Any, high: Any) -> Interval:
 
 
 _UFUNCS: dict[Any, Any] = {
+    np.less: lambda a, b: a < b,
+    np.less_equal: lambda a, b: a <= b,
+    np.greater: lambda a, b: a > b,
+    np.greater_equal: lambda a, b: a >= b,
     np.add: lambda a, b: a + b,
     np.subtract: lambda a, b: a - b,
     np.multiply: lambda a, b: a * b,
