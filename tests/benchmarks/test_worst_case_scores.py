@@ -79,7 +79,7 @@ def test_starts_push_both_ways_along_every_axis_and_away_from_the_plan(
     adversary = energy_adversary(expert.metric)
     target = SingleTarget(episodes, law, "tube", 0.1, adversary)
     starts = target.starts()
-    assert starts.shape == (3, 9, 90, 4)
+    assert starts.shape == (3, 19, 90, 4)
     assert [one.flights for one in search(target, SearchSettings("random", budget=4))] == [4] * 3
     constant = {tuple(row) for row in starts[0, :8, 40]}
     axes = np.concatenate([np.eye(4), -np.eye(4)])
@@ -167,7 +167,7 @@ def test_a_search_for_the_share_of_the_certificate_is_no_worse_than_its_starts(
     found = search(target, SearchSettings("cross-entropy", budget=20, population=10))
     starts = target.starts()
     for index, one in enumerate(found):
-        flown = target.scores(np.full(9, index), starts[index])
+        flown = target.scores(np.full(len(starts[index]), index), starts[index])
         assert one.score >= flown.max()
         again = fly(episodes, law, np.array([index]), 0.75 * one.sequence[None])
         assert check.hold(np.array([index]), again).certified_share[0] == one.score

@@ -33,7 +33,8 @@ def attack(
     goal: Annotated[
         str,
         typer.Option(
-            help="What to break: tube (||x - x_d||), success, or clearance (a fall, a collision)."
+            help="What to break: tube (||x - x_d|| over its radius), success, clearance (a fall, a "
+            "collision); of one body also error, the largest ||x - x_d||."
         ),
     ] = "success",
     bound: Annotated[float | None, BOUND] = None,
@@ -178,7 +179,8 @@ def summary(row: dict[str, Any]) -> list[str]:
         f"(random: worst {row['random_score_worst']:.4g})",
     ]
     if row.get("max_tracking_error_max") is not None:
-        lines.append(f"observed tube {row['max_tracking_error_max']:.3g}")
+        largest = row["max_tracking_error_max"]
+        lines.append(f"observed tube {largest:.3g}, {largest / row['bound']:.3g} per unit of d̄")
         if row.get("in_region_rate") is not None:
             left = round((1.0 - row["in_region_rate"]) * count)
             lines[-1] += f"; {left} of {count} flights left the region of the metric"

@@ -12,7 +12,6 @@ import numpy as np
 from lagros_benchmarks.run.metrics import wilson_interval
 from lagros_benchmarks.run.room import room_of
 from lagros_benchmarks.run.settings import check_policy
-from lagros_benchmarks.worst_case.goals import GOALS
 from lagros_benchmarks.worst_case.replay import Outcome, WorstCases
 from lagros_benchmarks.worst_case.search import MOST, Found, SearchSettings
 from lagros_benchmarks.worst_case.seeds import ATTACK
@@ -44,7 +43,7 @@ class AttackSettings:
     Attributes:
         task: As in `lagros attack TASK`.
         policy: As `lagros bench` takes it.
-        goal: What to break: "tube", "success" or "clearance".
+        goal: What to break: "tube", "success" or "clearance"; of one body also "error".
         bound: d_bar, in units of the state per second.
         episodes: Episodes, each with a worst disturbance of its own.
         seed: Seed of the run; its episodes belong to the namespace `ATTACK`.
@@ -72,7 +71,7 @@ class AttackSettings:
         check_fields(self)
         find_task(self.task)
         check_policy(self.policy, self.task)
-        check_name("goal", self.goal, GOALS)
+        check_name("goal", self.goal, bench_of(self.task).goals)
         check_positive("bound", self.bound)
         check_disturbance_bound("bound", self.bound)
         check_whole("episodes", self.episodes, 1, MOST)

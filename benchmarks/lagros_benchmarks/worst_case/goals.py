@@ -10,6 +10,8 @@ from lagros_envs.numbers import functions
 from lagros_envs.numbers.dual import gradients, seed
 
 GOALS = ("tube", "success", "clearance")
+# Of one body, which has one x_d, besides.
+SINGLE_GOALS = (*GOALS, "error")
 # Differences of the closed loop. Networks run in float32, whose rounding of an observation times
 # the gain must stay far below the step.
 _STEP = 1e-3
@@ -29,7 +31,7 @@ def profile(
         goal: "tube": the distance from x_d in radii r(t) of success, which have the shape of every
             tube of Theorem 1. "success": the distance from x_f less r(t), whose *least* value
             counts. "clearance": by how much the state is beyond what the task allows, or inside a
-            disc [m].
+            disc [m]. "error": ||x - x_d||, of the whole state.
         episode: Which episode each trajectory belongs to, shape (b,).
         states: Shape (b, steps + 1, n).
         gaps: As in `Flights`.
@@ -49,8 +51,10 @@ def profile(
     if goal == "success":
         goals = parts_of(episodes.goals[episode][:, None])
         return np.asarray(task.goal_distance(parts, goals, functions) - radius)
+    if goal == "error":
+        return np.asarray(np.linalg.norm(states - episodes.plans[episode], axis=-1))
     if goal != "tube":
-        raise ValueError(f"goal {goal!r} must be one of {', '.join(GOALS)}")
+        raise ValueError(f"goal {goal!r} must be one of {', '.join(SINGLE_GOALS)}")
     # Both may be zero at the start.
     error = tracking_error(episodes, episode, states)
     return np.asarray(error / np.maximum(radius, radius[1] * 1e-6))
@@ -68,9 +72,9 @@ def scores(
 ) -> tuple[FloatArray, IntArray]:
     """Return how bad each flight is, shape (b,), and the instant at which it is, shape (b,).
 
-    "clearance" takes the largest of the profile, that of the end with it; "tube" the largest and
-    "success" the least before any fall or collision. Success is broken where that is positive. A
-    flight whose policy raised is infinitely bad, whatever the goal.
+    "clearance" takes the largest of the profile, that of the end with it; "tube" and "error" the
+    largest and "success" the least before any fall or collision. Success is broken where that is
+    positive. A flight whose policy raised is infinitely bad, whatever the goal.
     """
     values = profile(episodes, goal, episode, flights.states, flights.gaps)
     # The state at the instant of the fall says only how hard the last control was.
@@ -92,8 +96,27 @@ def gradient(
 ) -> FloatArray:
     """Return the slope of the score by every push, shape (b, steps, n).
 
-    Central differences of one closed-loop step at all instants of all flights in two batches, then
-    the adjoint recursion backwards from the instant that decides the score.
+    The adjoint recursion backwards from the instant that decides the score.
+    """
+    steps, n = episodes.settings.steps, episodes.settings.system.state_dim
+    state_slopes, push_slopes = loop_slopes(episodes, law, episode, pushes, flights)
+    _, instant = scores(episodes, goal, episode, flights)
+    slope = _profile_slope(episodes, goal, episode, flights, instant)
+    result = np.zeros((len(episode), steps, n))
+    pull = np.zeros((len(episode), n))
+    for index in range(steps - 1, -1, -1):
+        pull = np.where((instant == index + 1)[:, None], slope, pull)
+        result[:, index] = np.einsum("bij,bi->bj", push_slopes[:, index], pull)
+        pull = np.einsum("bij,bi->bj", state_slopes[:, index], pull)
+    return result
+
+
+def loop_slopes(
+    episodes: Episodes, law: Law, episode: IntArray, pushes: FloatArray, flights: Flights
+) -> tuple[FloatArray, FloatArray]:
+    """Return the slopes of one closed-loop step by x and by d, each of shape (b, steps, n, n).
+
+    Central differences at all instants of all flights in two batches for each coordinate.
     """
     task = episodes.settings
     steps, n = task.steps, task.system.state_dim
@@ -110,17 +133,8 @@ def gradient(
         by_state[:, :, column] = (ends[0] - ends[1]) / (2.0 * _STEP)
         ends = [ahead(task, here, control, d) for d in (push + shift, push - shift)]
         by_push[:, :, column] = (ends[0] - ends[1]) / (2.0 * _STEP)
-    state_slopes = np.nan_to_num(by_state).reshape(count, steps, n, n)
-    push_slopes = np.nan_to_num(by_push).reshape(count, steps, n, n)
-    _, instant = scores(episodes, goal, episode, flights)
-    slope = _profile_slope(episodes, goal, episode, flights, instant)
-    result = np.zeros((count, steps, n))
-    pull = np.zeros((count, n))
-    for index in range(steps - 1, -1, -1):
-        pull = np.where((instant == index + 1)[:, None], slope, pull)
-        result[:, index] = np.einsum("bij,bi->bj", push_slopes[:, index], pull)
-        pull = np.einsum("bij,bi->bj", state_slopes[:, index], pull)
-    return result
+    shape = (count, steps, n, n)
+    return np.nan_to_num(by_state).reshape(shape), np.nan_to_num(by_push).reshape(shape)
 
 
 def _profile_slope(
@@ -138,7 +152,7 @@ def _profile_slope(
         return np.where(inner[:, None], towards, slope)
     target = episodes.goals[episode] if goal == "success" else episodes.plans[episode, instant]
     off = here - target
-    if task.position:
+    if task.position and goal != "error":
         counted = np.isin(np.arange(here.shape[1]), task.position)
         off = np.where(counted, off, 0.0)
     return off

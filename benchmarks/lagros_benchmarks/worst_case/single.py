@@ -14,6 +14,7 @@ from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.episodes import TUBE_TOLERANCE
 from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.library import make_single_policy
+from lagros_benchmarks.worst_case.aimed import aimed_sequences
 from lagros_benchmarks.worst_case.flights import (
     Episodes,
     Flights,
@@ -28,7 +29,13 @@ from lagros_benchmarks.worst_case.flights import (
     random_pushes,
     tracking_law,
 )
-from lagros_benchmarks.worst_case.goals import gradient, scores, tracking_error
+from lagros_benchmarks.worst_case.goals import (
+    SINGLE_GOALS,
+    gradient,
+    loop_slopes,
+    scores,
+    tracking_error,
+)
 from lagros_benchmarks.worst_case.replay import Outcome
 from lagros_benchmarks.worst_case.search import Found, search
 from lagros_benchmarks.worst_case.sequences import Replay
@@ -53,7 +60,7 @@ class SingleTarget:
     Attributes:
         flown: The episodes.
         law: The policy.
-        goal: One of `GOALS`.
+        goal: One of `SINGLE_GOALS`.
         bound: d_bar, in units of the state per second.
         adversary: A feedback whose pushes are tried first; None for none.
     """
@@ -96,13 +103,21 @@ class SingleTarget:
         return gradient(self.flown, self.law, self.goal, episode, pushes, flights)
 
     def starts(self) -> FloatArray:
-        """Return constant pushes along every axis, and what the adversary did."""
+        """Return constant pushes along every axis, what the adversary did, and aimed pushes."""
         axes = np.concatenate([np.eye(self.channels), -np.eye(self.channels)])
         axes = np.repeat(axes[:, None], self.steps, axis=1)
         constant = np.broadcast_to(axes, (self.episodes, *axes.shape))
-        if self.adversary is None:
-            return constant
-        return np.concatenate([constant, self._recorded(self.adversary)[:, None]], axis=1)
+        found = [constant]
+        if self.adversary is not None:
+            found.append(self._recorded(self.adversary)[:, None])
+        return np.concatenate([*found, self._aimed()], axis=1)
+
+    def _aimed(self) -> FloatArray:
+        """Return what is worst for the loop linearised along its calm flight, for every output."""
+        every = np.arange(self.episodes)
+        calm = np.zeros((self.episodes, self.steps, self.channels))
+        flights = fly(self.flown, self.law, every, calm)
+        return aimed_sequences(*loop_slopes(self.flown, self.law, every, calm, flights))
 
     def _recorded(self, adversary: Adversary) -> FloatArray:
         """Fly every episode under the adversary and return d/d_bar, (episodes, steps, n)."""
@@ -140,6 +155,7 @@ class SingleBench:
     """
 
     population = 30
+    goals = SINGLE_GOALS
 
     def __init__(self, settings: Any) -> None:
         self.settings = settings
@@ -256,7 +272,7 @@ class SingleBench:
 def replay_single(
     episodes: Episodes, index: int, policy: BasePolicy, goal: str, pushes: FloatArray
 ) -> tuple[Outcome, Flights | None]:
-    """Fly one sequence d (steps, n) in the environment of an episode, with a goal of `GOALS`.
+    """Fly one sequence d (steps, n) in the environment of an episode; the goal as in `profile`.
 
     Returns:
         The outcome, and the flight for further questions; None where it raised.
@@ -283,7 +299,12 @@ def replay_single(
     away = (flight.states - episodes.plans[index])[0][flight.alive[0]]
     lost = bool(flight.lost[0])
     left = lost or bool(np.any(errors > radius + TUBE_TOLERANCE))
-    broken = {"tube": left, "success": not info["success"], "clearance": lost}[goal]
+    broken = {
+        "tube": left,
+        "error": left,
+        "success": not info["success"],
+        "clearance": lost,
+    }[goal]
     measures: dict[str, float | bool | None] = {
         "success": bool(info["success"]),
         "strict_success": not lost and bool(info["inside_tube"]),

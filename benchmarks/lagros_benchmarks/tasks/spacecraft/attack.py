@@ -19,6 +19,7 @@ from lagros_benchmarks.tasks.spacecraft.worst_case import (
     SpacecraftTarget,
     first_adversaries,
 )
+from lagros_benchmarks.worst_case.goals import GOALS
 from lagros_benchmarks.worst_case.optimisers import make_search
 from lagros_benchmarks.worst_case.replay import Outcome
 from lagros_benchmarks.worst_case.search import Found, SearchSettings
@@ -43,6 +44,7 @@ class SpacecraftBench:
     """
 
     population = 16
+    goals = GOALS
 
     def __init__(self, settings: Any) -> None:
         self.settings = settings
