@@ -44,6 +44,8 @@ IntArray = NDArray[np.intp]
 
 # Give up where fewer than one state in so many is inside the verified region.
 _PATIENCE = 100
+# An episode, the control step at which a plan of it begins, and that plan.
+Planned = tuple[Scenario, int, Trajectory]
 # Kinds of disturbance whose closed loops fill the tube; `none` would only repeat the plan.
 _KINDS = ("uniform", "sphere", "constant", "sinusoid", "gust")
 
@@ -173,7 +175,7 @@ def generate(
     """
     task = task_of(task)
     make = partial(make_shard, metric=metric, settings=settings, task=task, network=network)
-    record = _record(metric, settings, task, network)
+    record = record_of(metric, settings, task, network)
     return _join(make_shards(folder, settings.shards, make, record, jobs, on_shard, backend))
 
 
@@ -186,26 +188,22 @@ def make_shard(
 ) -> Shard:
     """Generate one shard: plan, fill the tubes, keep the verified region, label."""
     expert = Expert(task, metric)
-    if network is not None and isinstance(expert.planner.settings, PlannerSettings):
-        # Where a network went wrong there is often no way; other guesses find none either.
-        expert.planner.settings = replace(expert.planner.settings, attempts=1)
-    count = settings.plans // settings.shards
-    seeds = episode_seeds(settings.seed, settings.plans)[index * count : (index + 1) * count]
-    episodes = [task.sample(episode_streams(seed).scenario) for seed in seeds]
+    episodes = episodes_of(index, settings, task)
     rng = np.random.default_rng([settings.seed, index])
     if network is None:
-        plans = [(one, 0, _planned(expert, one, one.initial_state, 0)) for one in episodes]
+        held = planned_episodes(expert, episodes)
     else:
-        pushes = _pushes(rng, len(episodes), task, settings.disturbance_bound)
+        ask_once(expert)
+        pushes = draw_pushes(rng, len(episodes), task, settings.disturbance_bound)
         met = met_states(rng, task, network, episodes, pushes)
         plans = [
             (episodes[which], step, _planned(expert, episodes[which], state, step))
             for which, step, state in met
         ]
-    held = [(episode, step, plan) for episode, step, plan in plans if plan is not None]
+        held = [(episode, step, plan) for episode, step, plan in plans if plan is not None]
     if not held:
-        raise ValueError(f"none of the {count} episodes of shard {index} has a plan")
-    shard = _plan_arrays(task, held)
+        raise ValueError(f"none of the {len(episodes)} episodes of shard {index} has a plan")
+    shard = plan_arrays(task, held)
     states, controls, first = (shard[f"plan_{name}"] for name in ("states", "controls", "steps"))
     tracked = expert.track(states, controls)
     wanted = settings.samples // settings.shards
@@ -235,6 +233,25 @@ def make_shard(
     return {**samples, **shard, "drawn": np.array(drawn)}
 
 
+def episodes_of(index: int, settings: ExpertDataSettings, task: Task) -> list[Scenario]:
+    """Return the random episodes of a shard."""
+    count = settings.plans // settings.shards
+    seeds = episode_seeds(settings.seed, settings.plans)[index * count : (index + 1) * count]
+    return [task.sample(episode_streams(seed).scenario) for seed in seeds]
+
+
+def ask_once(expert: Expert) -> None:
+    """Plan from one guess: where a flight went wrong there is often no way, from any of them."""
+    if isinstance(expert.planner.settings, PlannerSettings):
+        expert.planner.settings = replace(expert.planner.settings, attempts=1)
+
+
+def planned_episodes(expert: Expert, episodes: Sequence[Scenario]) -> list[Planned]:
+    """Plan episodes from their starts, and return those that have a plan."""
+    plans = [(one, 0, _planned(expert, one, one.initial_state, 0)) for one in episodes]
+    return [(episode, step, plan) for episode, step, plan in plans if plan is not None]
+
+
 def _planned(expert: Expert, episode: Scenario, state: FloatArray, step: int) -> Trajectory | None:
     """Return a plan from a state of an episode; None where there is none that holds."""
     plan = expert.planner.plan(state, episode.goal, step, discs=episode.discs)
@@ -242,7 +259,7 @@ def _planned(expert: Expert, episode: Scenario, state: FloatArray, step: int) ->
     return plan if plan.solved else None
 
 
-def _plan_arrays(task: Task, held: Sequence[tuple[Scenario, int, Trajectory]]) -> Shard:
+def plan_arrays(task: Task, held: Sequence[Planned]) -> Shard:
     """Return plans as `ExpertData` has them."""
     states = np.stack([_from_first(plan.states, task.steps + 1) for _, _, plan in held])
     controls = [_from_first(plan.controls, task.steps) for _, _, plan in held]
@@ -260,7 +277,7 @@ def _from_first(rows: FloatArray, count: int) -> FloatArray:
     return np.concatenate([np.repeat(rows[:1], count - len(rows), axis=0), rows])
 
 
-def _pushes(rng: np.random.Generator, count: int, task: Task, bound: float) -> FloatArray:
+def draw_pushes(rng: np.random.Generator, count: int, task: Task, bound: float) -> FloatArray:
     """Draw disturbances of episodes, each of a kind and a bound of its own, shape (p, N, n)."""
     # Every bound down to zero: the tube of a small disturbance lies inside that of a large one.
     bounds = bound * rng.random((count, 1, 1))
@@ -302,7 +319,7 @@ def tube_states(
     every = np.arange(plans)
     first = np.zeros(plans, int) if first is None else first
     task, period = expert.task, expert.task.control_period
-    pushes = _pushes(rng, plans, task, settings.disturbance_bound)
+    pushes = draw_pushes(rng, plans, task, settings.disturbance_bound)
     state = states[:, 0]
     met = np.empty((plans, steps, states.shape[-1]))
     for step in range(steps):
@@ -331,7 +348,7 @@ def _join(shards: list[Shard]) -> ExpertData:
     return ExpertData(**joined, drawn=int(sum(int(shard["drawn"]) for shard in shards)))
 
 
-def _record(
+def record_of(
     metric: Metric, settings: ExpertDataSettings, task: Task, network: Mlp | None
 ) -> dict[str, Any]:
     """Return all that the data depend on."""

@@ -23,7 +23,7 @@ BoolArray = NDArray[np.bool_]
 _WELL = 0.3
 _BEFORE = (1.0 / 30.0, 0.25)
 # So near the time limit nothing is planned.
-_LATEST = 0.9
+LATEST = 0.9
 
 
 def padded_discs(task: Task, episode: Scenario) -> FloatArray:
@@ -53,13 +53,13 @@ def met_states(
         Which episode, the control step and the state x, shape (n,), of each.
     """
     states = flown(task, network, episodes, pushes)
-    ended = _trouble(task, episodes, states)
+    ended = trouble(task, episodes, states)
     bad = ended.any(axis=1)
     steps = task.steps
     early, late = (max(1, round(share * steps)) for share in _BEFORE)
     before = np.argmax(ended, axis=1) - rng.integers(early, late + 1, len(states))
     step = np.where(bad, before, rng.integers(0, steps, len(states)))
-    picked = (bad | (rng.random(len(states)) < _WELL)) & (step <= _LATEST * steps)
+    picked = (bad | (rng.random(len(states)) < _WELL)) & (step <= LATEST * steps)
     return [
         (int(which), int(max(step[which], 0)), states[which, max(step[which], 0)])
         for which in np.flatnonzero(picked)
@@ -92,7 +92,7 @@ def flown(task: Task, network: Mlp, episodes: Sequence[Scenario], pushes: FloatA
     return states
 
 
-def _trouble(task: Task, episodes: Sequence[Scenario], states: FloatArray) -> BoolArray:
+def trouble(task: Task, episodes: Sequence[Scenario], states: FloatArray) -> BoolArray:
     """Return at which steps episodes collide or are about to fall, shape (p, N)."""
     # Where a state stays as it was, the next one would have fallen.
     ended: BoolArray = np.all(states[:, 1:] == states[:, :-1], axis=-1)
