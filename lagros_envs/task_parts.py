@@ -70,6 +70,9 @@ class Learning:
         round_plans: Episodes of each round.
         round_samples: Labelled states of each round.
         round_epochs: Passes over the data before each round.
+        scheduled: Whether (c) is affine in the state, u = c + K x with c and K made of the episode
+            and the time: the form of the law itself. It needs features that are affine in it.
+        slope_weight: Of the error of the slope of (c), du/dx against K, in the loss.
     """
 
     plans: int = 1000
@@ -83,6 +86,8 @@ class Learning:
     round_plans: int = 1000
     round_samples: int = 50_000
     round_epochs: int = 20
+    scheduled: bool = False
+    slope_weight: float = 0.0
 
 
 @dataclass(frozen=True)

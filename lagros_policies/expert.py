@@ -34,12 +34,15 @@ class TrackedPlans:
         controls: u_d, shape (p, N, m).
         first_step: Control step at which the plans begin.
         gains: The preferred feedback along the plans.
+        feedback: K of shape (p, N, m, n) where the flown law is u_d + K (x - x_d); None where it
+            is no linear gain.
     """
 
     states: FloatArray
     controls: FloatArray
     first_step: int
     gains: Any
+    feedback: FloatArray | None = None
 
 
 class Preference(Protocol):

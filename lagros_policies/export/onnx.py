@@ -97,9 +97,17 @@ def network_model(network: Mlp) -> bytes:
     Raises:
         ImportError: onnx is not installed.
     """
-    graph = _Graph()
-    answer = graph.layers("x", list(zip(network.weights, network.biases, strict=True)), "Tanh")
-    graph.call(answer, "y")
+    graph, count, size = _Graph(), network.scheduled, network.outputs
+    layers = list(zip(network.weights, network.biases, strict=True))
+    if not count:
+        graph.call(graph.layers("x", layers, "Tanh"), "y")
+    else:
+        state, rest = graph.split("x", [count, network.inputs - count])
+        offset, rows = graph.split(graph.layers(rest, layers, "Tanh"), [size, size * count])
+        gain = graph.do("Reshape", rows, np.array([-1, size, count]))
+        column = graph.do("Reshape", state, np.array([-1, count, 1]))
+        product = graph.do("Reshape", graph.do("MatMul", gain, column), np.array([-1, size]))
+        graph.call(graph.do("Add", product, offset), "y")
     return graph.model(("x", 1, network.inputs), ("y", 1, network.outputs), {})
 
 

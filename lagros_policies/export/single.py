@@ -20,13 +20,15 @@ from lagros_policies.learning.networks import Mlp
 def exported(policy: Any) -> Exported:
     """Take a `NetworkPolicy` apart."""
     task, network, see = cast(Task, policy.settings), cast(Mlp, policy.network), policy.see
+    count = network.scheduled
 
     def look(given: Numbers) -> tuple[Numbers, Numbers]:
         found = see(given, functions)
-        return found.features, found.signs
+        return found.features[count:], [*found.features[:count], *found.signs]
 
-    def act(outputs: Numbers, signs: Numbers) -> Numbers:
-        return [u * sign for u, sign in zip(outputs, signs, strict=True)] if signs else outputs
+    def act(outputs: Numbers, context: Numbers) -> Numbers:
+        controls, signs = affine(outputs, context[:count]), context[count:]
+        return [u * sign for u, sign in zip(controls, signs, strict=True)] if signs else controls
 
     program = Program(
         _parts(task),
@@ -38,6 +40,17 @@ def exported(policy: Any) -> Exported:
         metadata=(("unit", ", ".join(name.partition("[")[2][:-1] for name in task.control_names)),),
     )
     return Exported(program, partial(_answer, network, see), partial(example_observations, task))
+
+
+def affine(outputs: Numbers, state: Numbers) -> Numbers:
+    """Return c + K s of what the layers of a network give, c and the rows of K; see `Mlp`."""
+    count = len(state)
+    size = len(outputs) // (1 + count)
+    answers = list(outputs[:size])
+    for row in range(size):
+        for column, one in enumerate(state):
+            answers[row] = answers[row] + outputs[size + row * count + column] * one
+    return answers
 
 
 def _answer(network: Mlp, see: See, observation: Float32Array) -> Float32Array:

@@ -46,6 +46,8 @@ IntArray = NDArray[np.intp]
 _PATIENCE = 100
 # An episode, the control step at which a plan of it begins, and that plan.
 Planned = tuple[Scenario, int, Trajectory]
+# A control nearer to that of the linear law is that of the linear law.
+_SAME = 1e-6
 # Kinds of disturbance whose closed loops fill the tube; `none` would only repeat the plan.
 _KINDS = ("uniform", "sphere", "constant", "sinusoid", "gust")
 
@@ -95,6 +97,7 @@ class ExpertData:
     Attributes:
         observation: What the policy sees at the state, shape (s, o).
         control: u*, shape (s, m).
+        gain: K where the law is u_d + K (x - x_d), shape (s, m, n); (s, m, 0) where it has none.
         plan: Which plan each sample belongs to, shape (s,).
         plan_states: x_d, shape (p, N + 1, n); before the plan begins, where it begins.
         plan_controls: u_d, shape (p, N, m).
@@ -106,6 +109,7 @@ class ExpertData:
 
     observation: FloatArray
     control: FloatArray
+    gain: FloatArray
     plan: IntArray
     plan_states: FloatArray
     plan_controls: FloatArray
@@ -119,6 +123,26 @@ class ExpertData:
         plan, step = np.nonzero(np.arange(task.steps) >= self.plan_steps[:, None])
         seen = observations(task, self.plan_states[plan, step], step, plan, vars(self))
         return seen, self.plan_controls[plan, step], plan
+
+    def moves(self, task: Task, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Return directions of the state, shape (s, n), and how u* moves along them, (s, m).
+
+        Directions are random, of the spread of the errors; zero where u* is not the linear law, as
+        at the bounds of the control.
+
+        Raises:
+            ValueError: The law behind the labels has no linear gain.
+        """
+        if not self.gain.shape[-1]:
+            raise ValueError(f"the law of {task.name} has no linear gain along its plans")
+        layout = task.layout
+        step = np.rint(self.observation[:, layout.time] / task.control_period).astype(int).ravel()
+        error = self.observation[:, layout.state] - self.plan_states[self.plan, step]
+        push = np.einsum("smn,sn->sm", self.gain, error)
+        linear = self.plan_controls[self.plan, step] + push
+        same = np.isclose(self.control, linear, atol=_SAME).all(axis=1)
+        way = error.std(axis=0) * rng.standard_normal(error.shape) * same[:, None]
+        return way, np.einsum("smn,sn->sm", self.gain, way)
 
 
 def observations(
@@ -207,7 +231,10 @@ def make_shard(
     states, controls, first = (shard[f"plan_{name}"] for name in ("states", "controls", "steps"))
     tracked = expert.track(states, controls)
     wanted = settings.samples // settings.shards
-    parts: list[tuple[FloatArray, FloatArray, IntArray]] = []
+    gains = tracked.feedback
+    if gains is None:
+        gains = np.zeros((*controls.shape, 0))
+    parts: list[tuple[FloatArray, FloatArray, FloatArray, IntArray]] = []
     kept = drawn = 0
     while kept < wanted:
         if drawn > _PATIENCE * wanted:
@@ -226,11 +253,12 @@ def make_shard(
         inside, drawn = inside[:needed], drawn + len(points)
         points, plan_of, step = points[inside], plan_of[inside], step[inside]
         label = expert.control(tracked, plan_of, step, points)
-        parts.append((observations(task, points, step, plan_of, shard), label, plan_of))
+        seen = observations(task, points, step, plan_of, shard)
+        parts.append((seen, label, gains[plan_of, step], plan_of))
         kept += len(points)
-    observation, control, plan_of = (np.concatenate(part) for part in zip(*parts, strict=True))
-    samples = {"observation": observation, "control": control, "plan": plan_of}
-    return {**samples, **shard, "drawn": np.array(drawn)}
+    names = "observation", "control", "gain", "plan"
+    joined = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return {**dict(zip(names, joined, strict=True)), **shard, "drawn": np.array(drawn)}
 
 
 def episodes_of(index: int, settings: ExpertDataSettings, task: Task) -> list[Scenario]:

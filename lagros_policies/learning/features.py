@@ -21,6 +21,7 @@ from lagros_policies.learning.layers import Alike
 from lagros_policies.room import part_of
 
 Float32Array = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
 
 
 class Seen(NamedTuple):
@@ -37,6 +38,7 @@ class Seen(NamedTuple):
 
 
 Vector = Sequence[Any]
+_STEP = 1e-4  # of central differences, in units of the direction
 _SMALL = 1e-3  # lengths below are none [m, m/s]
 _MOTION = (
     "distance of the goal [m]",
@@ -85,16 +87,39 @@ def seen(see: See, observation: Float32Array) -> tuple[Float32Array, Float32Arra
     return features, signs if many.signs else None
 
 
+def moved(see: See, observation: FloatArray, way: FloatArray) -> FloatArray:
+    """Return how features move with an observation, by central differences in double precision.
+
+    Args:
+        see: The function.
+        observation: Shape (s, o).
+        way: Direction in which each moves, shape (s, o).
+
+    Returns:
+        Derivatives of the features, shape (s, f).
+    """
+
+    def at(place: FloatArray) -> FloatArray:
+        columns: Any = place.T
+        return np.stack(np.broadcast_arrays(*see(columns, functions).features), axis=-1)
+
+    slope: FloatArray = at(observation + _STEP * way) - at(observation - _STEP * way)
+    return slope / (2.0 * _STEP)
+
+
 class View(Protocol):
     """What the networks of a task see of an observation; built of the task.
 
     Attributes:
         names: Of the features.
         alike: Which of them are of things that are alike; None for none.
+        affine: How many of them, the first ones, are affine in the state while the others do not
+            depend on it; a network may be affine in these.
     """
 
     names: tuple[str, ...]
     alike: Alike | None
+    affine: int
 
     def __call__(self, observation: Sequence[Any], functions: Any) -> Seen:
         """See an observation, given by its components."""
@@ -116,6 +141,7 @@ class Stated:
     """
 
     alike: Alike | None = None
+    affine = 0
 
     def __init__(self, task: Task) -> None:
         """Count what it says."""
@@ -144,6 +170,8 @@ class Usual:
         names: Of the features.
         alike: How many discs the last features are of.
     """
+
+    affine = 0
 
     def __init__(self, task: Task) -> None:
         """Look at the coordinates."""

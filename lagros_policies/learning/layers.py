@@ -75,21 +75,50 @@ def outputs_of(
     layers: Sequence[torch.nn.Linear], inputs: torch.Tensor, alike: Alike | None
 ) -> torch.Tensor:
     """Return the outputs (s, outputs) for inputs (s, inputs), with tanh between the layers."""
+    return moved_outputs(layers, [inputs], alike)[0]
+
+
+def moved_outputs(
+    layers: Sequence[torch.nn.Linear], inputs: Sequence[torch.Tensor], alike: Alike | None
+) -> list[torch.Tensor]:
+    """Return outputs and how they move with the inputs.
+
+    Args:
+        layers: The layers, with tanh between them.
+        inputs: The inputs, shape (s, inputs), and perhaps directions in which they move, likewise.
+        alike: Which inputs are of things that are alike.
+
+    Returns:
+        The outputs, shape (s, outputs), and their slopes along the directions.
+    """
     import torch
 
-    values = inputs
+    values = list(inputs)
     if alike is not None:
-        rest = inputs[:, : -alike.things * alike.size]
-        each = inputs[:, -alike.things * alike.size :].reshape(-1, alike.things, alike.size)
-        beside = rest[:, None].expand(-1, alike.things, -1)
-        things, own = torch.cat([beside, each], -1), rest
+        things, own = [], []
+        for one in values:
+            rest = one[:, : -alike.things * alike.size]
+            each = one[:, -alike.things * alike.size :].reshape(-1, alike.things, alike.size)
+            things.append(torch.cat([rest[:, None].expand(-1, alike.things, -1), each], -1))
+            own.append(rest)
         for of_things, of_rest in zip(layers[0:4:2], layers[1:4:2], strict=True):
-            things, own = torch.tanh(of_things(things)), torch.tanh(of_rest(own))
-        values, layers = torch.cat([things.sum(1), own], 1), layers[4:]
+            things, own = _bent(_through(of_things, things)), _bent(_through(of_rest, own))
+        values = [torch.cat([many.sum(1), one], 1) for many, one in zip(things, own, strict=True)]
+        layers = layers[4:]
     for layer in layers[:-1]:
-        values = torch.tanh(layer(values))
-    answer: torch.Tensor = layers[-1](values)
-    return answer
+        values = _bent(_through(layer, values))
+    return _through(layers[-1], values)
+
+
+def _through(layer: torch.nn.Linear, values: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    """Return what a layer makes of values and of directions, to which no bias is added."""
+    return [layer(values[0]), *(one @ layer.weight.T for one in values[1:])]
+
+
+def _bent(values: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    """Return tanh of values and what directions become."""
+    first = values[0].tanh()
+    return [first, *((1.0 - first * first) * one for one in values[1:])]
 
 
 def written_out(

@@ -24,6 +24,7 @@ Layers = Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
 _FORMAT = "lagros-mlp-1"
 _CHECKSUM = "sha256"
 _ALIKE = "alike"  # inputs of things that are alike: how many, and inputs of each
+_SCHEDULED = "scheduled"  # how many inputs the outputs are affine in
 _LAYER = "layer"
 
 
@@ -33,12 +34,18 @@ class Mlp:
     Normalisation of inputs and outputs is folded into the first and last layer, so that one call
     is the layers and nothing else.
 
+    Its outputs y may be affine in the first inputs s: the layers then see the others, z, alone, and
+    give an offset c(z) and a gain K(z), y = c(z) + K(z) s. That is a law with a scheduled gain, of
+    the form of u_d + K (x - x_d) itself.
+
     Args:
         weights: One matrix (inputs, outputs) per layer.
         biases: One vector (outputs,) per layer.
         metadata: Strings that describe the network; stored beside the weights.
         alike: Which inputs are of things that are alike; then the layers are those that
             `written_out` takes, and the file holds these.
+        scheduled: How many inputs s the outputs are affine in, k; the last layer has m (1 + k)
+            outputs, first c, then the rows of K.
 
     Raises:
         ValueError: The shapes do not chain, or a number is not finite.
@@ -50,6 +57,7 @@ class Mlp:
         biases: Sequence[NDArray[np.floating]],
         metadata: dict[str, str] | None = None,
         alike: Alike | None = None,
+        scheduled: int = 0,
     ) -> None:
         """Copy the layers to float32."""
         if not weights or len(weights) != len(biases):
@@ -59,6 +67,11 @@ class Mlp:
             weights, biases = written_out(weights, biases, alike)
         layers = checked_layers(list(zip(weights, biases, strict=True)))
         self.weights, self.biases = [one for one, _ in layers], [other for _, other in layers]
+        if self.biases[-1].size % (1 + scheduled):
+            raise ValueError(
+                f"{self.biases[-1].size} outputs are no offsets with {scheduled} gains each"
+            )
+        self.scheduled = scheduled
         self.metadata = dict(metadata or {})
         self._hidden = layers[:-1]
         # Buffers of the hidden layers that no evaluation is using: several threads may evaluate.
@@ -67,12 +80,12 @@ class Mlp:
     @property
     def inputs(self) -> int:
         """Number of inputs."""
-        return int(self.weights[0].shape[0])
+        return int(self.weights[0].shape[0]) + self.scheduled
 
     @property
     def outputs(self) -> int:
         """Number of outputs."""
-        return int(self.weights[-1].shape[1])
+        return int(self.weights[-1].shape[1]) // (1 + self.scheduled)
 
     def __call__(self, features: Float32Array) -> Float32Array:
         """Evaluate the network.
@@ -83,6 +96,26 @@ class Mlp:
         Returns:
             Shape (outputs,) or (batch, outputs).
         """
+        if self.scheduled:
+            offset, gain = self.law(features[..., self.scheduled :])
+            product = gain @ features[..., : self.scheduled, None]
+            product[..., 0] += offset
+            answer: Float32Array = product[..., 0]
+            return answer
+        return self._through(features)
+
+    def law(self, scheduling: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """Return the offset c(z), shape (..., m), and the gain K(z), shape (..., m, k).
+
+        Args:
+            scheduling: The other inputs z, shape (..., inputs - k).
+        """
+        layer = self._through(scheduling)
+        m, shape = self.outputs, layer.shape[:-1]
+        return layer[..., :m], layer[..., m:].reshape(*shape, m, self.scheduled)
+
+    def _through(self, features: Float32Array) -> Float32Array:
+        """Return what the layers give."""
         if features.ndim == 1:
             return self._single(features)
         layer: Float32Array = features
@@ -118,6 +151,8 @@ class Mlp:
         if self._alike is not None:
             layers = [(_float32(weight), _float32(bias)) for weight, bias in self._stored]
             metadata[_ALIKE] = json.dumps(self._alike)
+        if self.scheduled:
+            metadata[_SCHEDULED] = str(self.scheduled)
         write_safetensors(path, tensors_of({_LAYER: layers}), metadata)
 
     @classmethod
@@ -136,7 +171,7 @@ class Mlp:
         (layers,) = layers_of(path, tensors, (_LAYER,))
         try:
             weights, biases = [weight for weight, _ in layers], [bias for _, bias in layers]
-            return cls(weights, biases, metadata, _alike(metadata))
+            return cls(weights, biases, metadata, _alike(metadata), _scheduled(metadata))
         except ValueError as error:
             raise ValueError(f"{path} is damaged: {error}") from error
 
@@ -212,6 +247,18 @@ def _alike(metadata: dict[str, str]) -> Alike | None:
     if numbers is None:
         raise ValueError(f"{_ALIKE}={shown(text)} must be two whole numbers")
     return Alike(*map(int, numbers.groups()))
+
+
+def _scheduled(metadata: dict[str, str]) -> int:
+    """Take from the metadata of a file how many inputs the outputs are affine in.
+
+    Raises:
+        ValueError: It is not said in one whole number.
+    """
+    text = metadata.pop(_SCHEDULED, "0")
+    if re.fullmatch(r"0|[1-9]\d{0,3}", text) is None:
+        raise ValueError(f"{_SCHEDULED}={shown(text)} must be a whole number")
+    return int(text)
 
 
 def write_safetensors(path: Path | str, tensors: Tensors, metadata: dict[str, str]) -> None:

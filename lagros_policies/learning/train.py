@@ -6,16 +6,25 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.checks import check_each, check_fields, check_positive, check_seed, check_whole
+from lagros_envs.checks import (
+    check_at_least,
+    check_each,
+    check_fields,
+    check_not_negative,
+    check_positive,
+    check_seed,
+    check_whole,
+)
 from lagros_policies.learning.checkpoint import load_values
 from lagros_policies.learning.fitting import Fit, IntArray, one_thread
-from lagros_policies.learning.layers import Alike, new_layers, outputs_of
+from lagros_policies.learning.layers import Alike, moved_outputs, new_layers
 from lagros_policies.learning.networks import Mlp
+from lagros_policies.learning.scheduling import Schedule, schedule_of
 
 if TYPE_CHECKING:
     import torch
@@ -42,6 +51,8 @@ class TrainingSettings:
         epochs: Passes over the data.
         batch: Samples per step.
         learning_rate: Adam's step at first; a cosine takes it to a hundredth of that.
+        scheduled: How many of the first inputs the outputs are affine in, see `Mlp`.
+        slope_weight: Of the error of the slope along a random direction, beside that of the value.
         held_out: Share of the plans whose samples are never trained on.
         checkpoint_every: Epochs between checkpoints.
         seed: Seed of initial weights and sample order.
@@ -54,6 +65,8 @@ class TrainingSettings:
     epochs: int = 600
     batch: int = 512
     learning_rate: float = 3e-3
+    scheduled: int = 0
+    slope_weight: float = 0.0
     held_out: float = 0.1
     checkpoint_every: int = 25
     seed: int = 0
@@ -66,8 +79,22 @@ class TrainingSettings:
             check_whole(name, getattr(self, name))
         check_seed(self.seed)
         check_positive("learning_rate", self.learning_rate)
+        check_at_least("scheduled", self.scheduled, 0)
+        check_not_negative("slope_weight", self.slope_weight)
         if not 0.0 < self.held_out < 1.0:
             raise ValueError(f"held_out={self.held_out!r} must be in (0, 1)")
+
+
+class Moves(NamedTuple):
+    """How inputs and labels move together, along one direction for each sample.
+
+    Attributes:
+        features: Derivatives of the inputs, shape (s, inputs).
+        labels: Derivatives of the labels, shape (s, outputs).
+    """
+
+    features: Float32Array
+    labels: Float32Array
 
 
 @dataclass(frozen=True)
@@ -107,8 +134,12 @@ def fit(
     alike: Alike | None = None,
     after: Path | None = None,
     first: int | None = None,
+    moves: Moves | None = None,
 ) -> Mlp:
     """Fit a network by Adam on the mean of ||u_L - u*||, the loss of the paper.
+
+    Where the labels are known to move with the inputs, as u* does by K, the mean error of that
+    slope is added, with a weight: what is proved of the loop depends on it.
 
     Args:
         features: Inputs, shape (s, inputs).
@@ -120,15 +151,26 @@ def fit(
         after: Checkpoint of a fit that ended, with whose weights this one begins.
         first: How many of the samples say how inputs and outputs are scaled, the first ones, as
             they did in that fit; None for all.
+        moves: How inputs and labels move together; None where that is not known.
 
     Returns:
         The network, with the normalisation folded in.
 
     Raises:
-        ValueError: A checkpoint is damaged, or of other settings or data.
+        ValueError: A checkpoint is damaged, or of other settings or data; slopes are asked for that
+            are not known; or a schedule where inputs are of things that are alike.
     """
+    if settings.slope_weight > 0.0 and moves is None:
+        raise ValueError(
+            f"slope_weight={settings.slope_weight:g} needs labels that are known to move with the "
+            "inputs: the law behind them has no linear gain"
+        )
+    if settings.scheduled and alike is not None:
+        raise ValueError(
+            f"scheduled={settings.scheduled} is for networks without things that are alike"
+        )
     with one_thread():
-        run = _Run(features, labels, settings, checkpoint, alike, after, first)
+        run = _Run(features, labels, settings, checkpoint, alike, after, first, moves)
         run.finish(on_epoch)
         return run.network()
 
@@ -149,18 +191,34 @@ class _Run(Fit[TrainingSettings]):
         alike: Alike | None,
         after: Path | None,
         first: int | None,
+        moves: Moves | None,
     ) -> None:
         import torch
 
         self.alike = alike
-        self.input_mean, self.input_scale = _statistics(features[:first], _STEADY, alike)
+        count = settings.scheduled
+        given = features[:, count:]
+        self.input_mean, self.input_scale = _statistics(given[:first], _STEADY, alike)
         self.output_mean, self.output_units = _units(labels[:first])
-        self.features = torch.from_numpy((features - self.input_mean) / self.input_scale)
-        self.labels = torch.from_numpy(_in_units(labels - self.output_mean, self.output_units))
+        wanted = _in_units(labels - self.output_mean, self.output_units)
+        self.features = torch.from_numpy((given - self.input_mean) / self.input_scale)
+        self.labels = torch.from_numpy(wanted)
+        self.moved: list[torch.Tensor] = []
+        if moves is not None:
+            slopes = _in_units(moves.labels, self.output_units)
+            along = [moves.features[:, count:] / self.input_scale, moves.features[:, :count]]
+            self.moved = [torch.from_numpy(part) for part in (*along, slopes)]
+        self.affine = torch.from_numpy(np.ascontiguousarray(features[:, :count]))
+        self.schedule: Schedule | None = None
+        if count:
+            pair = None if moves is None else (moves.features[:first, :count], slopes[:first])
+            self.schedule = schedule_of(features[:first, :count], wanted[:first], pair)
         torch.manual_seed(settings.seed)
-        widths = [features.shape[1], *settings.hidden, labels.shape[1]]
+        widths = [given.shape[1], *settings.hidden, labels.shape[1] * (1 + count)]
         self.layers = new_layers(widths, alike)
         data = hashlib.sha256(features.tobytes() + labels.tobytes())
+        for part in moves or ():
+            data.update(part.tobytes())
         parameters = [value for layer in self.layers for value in layer.parameters()]
         if after is not None:
             load_values(after, parameters)
@@ -174,13 +232,17 @@ class _Run(Fit[TrainingSettings]):
         return [order[first : first + size] for first in range(0, len(order), size)]
 
     def loss(self, batch: IntArray) -> torch.Tensor:
-        """Return the mean of ||u_L - u*|| over a batch."""
+        """Return the mean of ||u_L - u*|| over a batch, and of the error of the slope."""
         import torch
 
         rows = torch.from_numpy(batch)
-        error = outputs_of(self.layers, self.features[rows], self.alike) - self.labels[rows]
-        # The paper's loss is the norm of the error; smoothed at zero so that it has a gradient.
-        return torch.sqrt((error * error).sum(1) + 1e-6).mean()
+        weight = self.settings.slope_weight
+        ways = [part[rows] for part in self.moved] if weight else []
+        found = moved_outputs(self.layers, [self.features[rows], *ways[:1]], self.alike)
+        if self.schedule is not None:
+            found = self.schedule.answers(found, [self.affine[rows], *ways[1:2]])
+        total = _norms(found[0] - self.labels[rows])
+        return total + weight * _norms(found[1] - ways[2]) if ways else total
 
     def network(self) -> Mlp:
         """Return the network with the normalisation folded into its first and last layer."""
@@ -191,9 +253,23 @@ class _Run(Fit[TrainingSettings]):
             seen = slice(len(weights[index]))
             weights[index] = weights[index] / self.input_scale[seen, None]
             biases[index] = biases[index] - self.input_mean[seen] @ weights[index]
-        weights[-1] = weights[-1] @ self.output_units
-        biases[-1] = biases[-1] @ self.output_units + self.output_mean
-        return Mlp(weights, biases, alike=self.alike)
+        if self.schedule is not None:
+            weights[-1], biases[-1] = self.schedule.folded(
+                weights[-1], biases[-1], self.output_units
+            )
+            biases[-1][: len(self.output_mean)] += self.output_mean
+        else:
+            weights[-1] = weights[-1] @ self.output_units
+            biases[-1] = biases[-1] @ self.output_units + self.output_mean
+        return Mlp(weights, biases, alike=self.alike, scheduled=self.settings.scheduled)
+
+
+def _norms(error: torch.Tensor) -> torch.Tensor:
+    """Return the mean norm of errors (s, m)."""
+    import torch
+
+    # The paper's loss is the norm of the error; smoothed at zero so that it has a gradient.
+    return torch.sqrt((error * error).sum(1) + 1e-6).mean()
 
 
 def _statistics(

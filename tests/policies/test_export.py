@@ -34,11 +34,12 @@ def by_hand(network, observation):
         layer = np.append(
             mirror * np.array([x[0] - goal[0], *x[1:], goal[0] - start[0], start[1]]), t
         )
+        near, layer = layer[: network.scheduled], layer[network.scheduled :]
         for index, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
             layer = layer @ weight.astype(float) + bias
             if index < len(network.weights) - 1:
                 layer = np.tanh(layer)
-        forces.append(mirror * layer)
+        forces.append(mirror * (layer[:1] + layer[1:] @ near))
     return np.array(forces)
 
 
@@ -223,10 +224,14 @@ def test_onnx_ports_and_provenance():
 
 
 @needs_onnx
-def test_onnx_of_a_bare_network(tmp_path):
+@pytest.mark.parametrize("scheduled", [0, 2])
+def test_onnx_of_a_bare_network(scheduled):
     import onnxruntime
 
-    network = Mlp.load(save_network(tmp_path / "own.safetensors", (20, 10)))
+    rng = np.random.default_rng(0)
+    pairs = (7 - scheduled, 20), (20, 1 + scheduled)
+    layers = [(rng.standard_normal(pair), rng.standard_normal(pair[1])) for pair in pairs]
+    network = Mlp(*zip(*layers, strict=True), scheduled=scheduled)
     session = onnxruntime.InferenceSession(
         network_model(network), providers=["CPUExecutionProvider"]
     )

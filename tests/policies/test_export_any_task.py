@@ -63,6 +63,24 @@ def test_a_task_of_anybody_is_exported_with_its_features(name, answer, tmp_path)
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5 * np.max(np.abs(wanted)))
 
 
+def test_a_scheduled_gain_is_exported(answer, tmp_path):
+    rng = np.random.default_rng(3)
+    layers = [
+        (rng.standard_normal(pair), rng.standard_normal(pair[1])) for pair in ((3, 20), (20, 5))
+    ]
+    network = Mlp(*zip(*layers, strict=True), scheduled=4)
+    network.save(tmp_path / "own.safetensors")
+    source = load_source("lagros-cartpole", tmp_path / "own.safetensors")
+    rows = source.examples(300, seed=2)
+    side = np.where(rows[:, 9] < 0.0, -1.0, 1.0)[:, None]
+    state, goal, start = rows[:, :4], rows[:, 4:8], rows[:, 8:12]
+    scheduling = np.column_stack([side * (goal - start)[:, :1], side * start[:, 1:2], rows[:, 12]])
+    numbers = np.tanh(scheduling @ layers[0][0] + layers[0][1]) @ layers[1][0] + layers[1][1]
+    near = side * (state - [[1.0, 0.0, 0.0, 0.0]] * goal)
+    wanted = side * (numbers[:, :1] + (numbers[:, 1:] * near).sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(answer(source, rows), wanted, rtol=2e-5, atol=1e-4)
+
+
 def test_nan_is_not_hidden_by_a_choice(answer, tmp_path):
     """What is seen of a disc is chosen by its radius: NaN would say that there is none."""
     task = find_task("pvtol")

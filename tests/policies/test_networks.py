@@ -55,6 +55,52 @@ def test_network_agrees_with_torch(widths):
     assert (network.inputs, network.outputs) == (widths[0], widths[-1])
 
 
+def scheduled_network(seed=0, state=3, others=2, controls=2):
+    widths = (others, 9, controls * (1 + state))
+    plain = random_network(widths, seed)
+    return Mlp(plain.weights, plain.biases, scheduled=state), plain
+
+
+def test_a_scheduled_gain_is_affine_in_the_first_inputs():
+    network, plain = scheduled_network()
+    rows = np.random.default_rng(1).standard_normal((50, 5)).astype(np.float32)
+    assert (network.inputs, network.outputs) == (5, 2)
+    offset, gain = network.law(rows[:, 3:])
+    layers = plain(rows[:, 3:])
+    for index, row in enumerate(rows):
+        wanted = [
+            layers[index, which]
+            + sum(layers[index, 2 + 3 * which + column] * row[column] for column in range(3))
+            for which in range(2)
+        ]
+        assert network(row) == pytest.approx(wanted, abs=1e-5)
+        assert network(row).dtype == np.float32
+        c, k = network.law(row[3:])
+        assert c + k @ row[:3] == pytest.approx(wanted, abs=1e-5)
+    assert network(rows) == pytest.approx(offset + np.einsum("smk,sk->sm", gain, rows[:, :3]))
+
+
+def test_a_file_says_that_a_gain_is_scheduled(tmp_path):
+    network, plain = scheduled_network()
+    path, other = tmp_path / "network", tmp_path / "plain"
+    network.save(path)
+    plain.save(other)
+    row = np.ones(5, np.float32)
+    assert np.array_equal(Mlp.load(path)(row), network(row))
+    assert Mlp.load(path).scheduled == 3
+    assert Mlp.load(other).scheduled == 0
+    Mlp.load(path).save(tmp_path / "again")
+    assert (tmp_path / "again").read_bytes() == path.read_bytes()
+    tensors, metadata = read_safetensors(path)
+    for said in ("-1", "1.5", "four"):
+        write_safetensors(path, tensors, {**metadata, "scheduled": said})
+        with pytest.raises(ValueError, match="scheduled"):
+            Mlp.load(path)
+    write_safetensors(path, tensors, {**metadata, "scheduled": "4"})
+    with pytest.raises(ValueError, match="4 gains"):
+        Mlp.load(path)
+
+
 def test_network_keeps_its_own_copy_of_the_layers():
     # float32 and contiguous already, so that nothing else forces a copy.
     weight, bias = np.ones((2, 1), np.float32), np.zeros(1, np.float32)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from lagros_policies.learning.layers import Alike, moved_outputs
 from lagros_policies.learning.networks import Mlp, read_safetensors
-from lagros_policies.learning.train import TrainingSettings, fit, learning_error
+from lagros_policies.learning.train import Moves, TrainingSettings, _Run, fit, learning_error
 
 SETTINGS = TrainingSettings(
     hidden=(12, 12), epochs=9, batch=64, learning_rate=1e-2, checkpoint_every=2, seed=3
@@ -53,6 +54,89 @@ def test_it_learns_a_function_on_any_scale(data, tmp_path):
     assert losses[-1] < 0.1 * losses[0]
     assert (network.inputs, network.outputs) == (3, 1)
     assert [weight.shape for weight in network.weights] == [(3, 12), (12, 12), (12, 1)]
+
+
+def law_data(count=1500, seed=1):
+    """Return z, s, and u = c(z) + K(z) s of two controls, known in closed form, and its moves."""
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(-1.0, 1.0, (count, 2))
+    offset = np.stack([30.0 * z[:, 0], np.cos(2.0 * z[:, 1])], axis=-1)
+    gain = np.zeros((count, 2, 3))
+    gain[:, 0] = [40.0, -2.0, 0.0] + 10.0 * z[:, :1] * [1.0, 0.0, 0.1]
+    gain[:, 1, 1] = 3.0 + z[:, 1]
+    # States lie near those of a plan, so that values alone say little of the gain.
+    state = np.stack([z[:, 0], z[:, 1] ** 2, z[:, 0] * z[:, 1]], axis=-1)
+    state += 0.02 * rng.standard_normal(state.shape)
+    labels = offset + np.einsum("smn,sn->sm", gain, state)
+    way = 0.02 * rng.standard_normal(state.shape)
+    moves = Moves(
+        np.column_stack([way, np.zeros_like(z)]).astype(np.float32),
+        np.einsum("smn,sn->sm", gain, way).astype(np.float32),
+    )
+    features = np.column_stack([state, z]).astype(np.float32)
+    return features, labels.astype(np.float32), gain, moves
+
+
+@pytest.mark.parametrize("scheduled", [0, 3])
+def test_slopes_are_learned_where_they_are_asked_for(scheduled, tmp_path):
+    features, labels, gain, moves = law_data()
+    settings = replace(SETTINGS, hidden=(24, 24), epochs=50, scheduled=scheduled)
+
+    def slope_error(network):
+        step = 0.1
+        shift = np.zeros_like(features)
+        found = np.empty_like(gain)
+        for column in range(3):
+            shift[:] = 0.0
+            shift[:, column] = step
+            ends = network(features + shift), network(features - shift)
+            found[..., column] = (ends[0] - ends[1]) / (2.0 * step)
+        return np.abs(found - gain).mean()
+
+    errors = {}
+    for weight in (0.0, 0.5):
+        made = replace(settings, slope_weight=weight)
+        network = fit(features, labels, made, tmp_path / f"{weight}", moves=moves)
+        assert np.abs(network(features) - labels).mean() < 0.05 * labels.std()
+        assert network.scheduled == scheduled
+        errors[weight] = slope_error(network)
+    assert errors[0.5] < 0.8 * errors[0.0]
+    if scheduled:
+        assert errors[0.5] < 1.0
+        np.testing.assert_allclose(
+            network.law(features[:, 3:])[1].mean(axis=0), gain.mean(axis=0), atol=3.0
+        )
+
+
+def test_the_gradient_of_the_slope_is_that_of_differences(tmp_path):
+    features, labels, _, moves = law_data(64)
+    run = _Run(
+        features, labels, replace(SETTINGS, scheduled=3, slope_weight=1.0), tmp_path / "run",
+        None, None, None, moves,
+    )  # fmt: skip
+    given, state, slope = run.moved
+    ways = [run.features, given + 1.0], [run.affine, state]
+    found = run.schedule.answers(moved_outputs(run.layers, ways[0], None), ways[1])
+    step = 1e-3
+    ends = [
+        run.schedule.answers(
+            moved_outputs(run.layers, [run.features + end * ways[0][1]], None),
+            [run.affine + end * state],
+        )[0]
+        for end in (step, -step)
+    ]
+    numeric = ((ends[0] - ends[1]) / (2.0 * step)).detach().numpy()
+    np.testing.assert_allclose(
+        found[1].detach().numpy(), numeric, atol=2e-3 * np.abs(numeric).max()
+    )
+    assert slope.shape == found[1].shape
+
+
+def test_slopes_that_are_not_known_are_refused(data, tmp_path):
+    with pytest.raises(ValueError, match="slope_weight"):
+        fit(*data, replace(SETTINGS, slope_weight=0.1), tmp_path / "run")
+    with pytest.raises(ValueError, match="alike"):
+        fit(*data, replace(SETTINGS, scheduled=1), tmp_path / "run", alike=Alike(1, 1))
 
 
 def test_a_constant_input_does_no_harm(data, tmp_path):

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from lagros_benchmarks.run.experiment import Progress
 from lagros_benchmarks.run.fingerprints import described
 from lagros_benchmarks.run.reproduction import Say, made_before
 from lagros_benchmarks.run.settings import BenchmarkSettings
-from lagros_envs.arrays import Float32Array, IntArray
+from lagros_envs.arrays import BoolArray, Float32Array, IntArray
 from lagros_envs.checks import check_fields
 from lagros_envs.files import write_atomic
 from lagros_envs.registry import find_task, task_names
@@ -31,16 +31,17 @@ from lagros_envs.tasks import SHIPPED
 from lagros_policies.backends import LOKY, Backend
 from lagros_policies.contraction import Metric, load_metric, save_metric
 from lagros_policies.learning.dataset import ExpertData, ExpertDataSettings, generate
-from lagros_policies.learning.features import seen, view_of
+from lagros_policies.learning.features import moved, seen, view_of
 from lagros_policies.learning.layers import check_widths
 from lagros_policies.learning.metric import metric_settings
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.learning.shards import claim
-from lagros_policies.learning.train import TrainingSettings, fit, learning_error
+from lagros_policies.learning.train import Moves, TrainingSettings, fit, learning_error
 from lagros_policies.trained_for import training_of, weights_record
 
 _SHARDS = 20  # pieces of work, where they divide plans and samples
 _LEAST = 10  # plans in each
+_MOVES = 0x6D6F7665  # seed of the directions in which slopes are learned
 _POLICIES = ("learned", "tube-mpc", "lagros", "lqr")
 
 
@@ -97,6 +98,10 @@ class ReproduceSettings:
                 f"{task.name} does not say how its networks are made: give its class `learning = "
                 "Learning(...)`"
             )
+        form: dict[str, Any] = {
+            "scheduled": _affine_features(task) if how.scheduled else 0,
+            "slope_weight": how.slope_weight,
+        }
         said = {
             "metric": metric_settings(task),
             "data": _data(how, how.plans, how.samples, 0),
@@ -105,8 +110,8 @@ class ReproduceSettings:
                 _data(how, how.round_plans, how.round_samples, seed)
                 for seed in range(1, how.rounds + 1)
             ),
-            "between": TrainingSettings(how.hidden, how.round_epochs, how.batch),
-            "lagros": TrainingSettings(how.hidden, how.epochs, how.batch),
+            "between": TrainingSettings(how.hidden, how.round_epochs, how.batch, **form),
+            "lagros": TrainingSettings(how.hidden, how.epochs, how.batch, **form),
             "learned": TrainingSettings(how.hidden, how.learned_epochs, how.batch),
             "episodes": task.defaults.episodes,
             "bound": task.defaults.bound,
@@ -162,6 +167,21 @@ class ReproduceSettings:
         )
 
 
+def _affine_features(task: Task) -> int:
+    """Return how many features are affine in the state.
+
+    Raises:
+        ValueError: None are.
+    """
+    count = view_of(task).affine
+    if not count:
+        raise ValueError(
+            f"{task.name}: learning.scheduled needs features that are affine in the state, and "
+            "others that do not depend on it: its view has none (affine = 0)"
+        )
+    return count
+
+
 def _data(how: Learning, plans: int, samples: int, seed: int) -> ExpertDataSettings:
     # A piece without any plan is an error: where there are few, they are in few pieces.
     shards = math.gcd(max(1, min(_SHARDS, plans // _LEAST)), plans, samples)
@@ -191,15 +211,14 @@ class _Making:
         assert settings.rounds is not None
         metric = self._metric()
         parts = [self._data("data", "expert data", metric, settings.data)]
-        samples = [self._samples(parts[0].observation, parts[0].control, parts[0].plan)]
+        samples = [self._labelled(parts[0], 0)]
         after = None
         for number, data in enumerate(settings.rounds, 1):
             name = f"round{number}"
             network = self._network(f"before_{name}", settings.between, samples, after)
             after = self.folder / f"before_{name}_checkpoint.safetensors"
             parts.append(self._data(name, f"round {number}", metric, data, network))
-            found = parts[-1]
-            samples.append(self._samples(found.observation, found.control, found.plan))
+            samples.append(self._labelled(parts[-1], number))
         # (c) imitates u* in the tube, (a) imitates u_d on the plans.
         self._final("lagros", settings.lagros, samples, after)
         plans = [self._samples(*parts[0].nominal_pairs(self.task))]
@@ -254,7 +273,23 @@ class _Making:
         """Return features, labels and plans of samples."""
         features, signs = seen(self.see, observation.astype(np.float32))
         labels = control if signs is None else control * signs
-        return features, labels.astype(np.float32), plan
+        return Samples(features, labels.astype(np.float32), plan)
+
+    def _labelled(self, data: ExpertData, number: int) -> Samples:
+        """Return the samples of (c), and how features and labels move where that is asked for."""
+        found = self._samples(data.observation, data.control, data.plan)
+        assert self.settings.lagros is not None
+        if not self.settings.lagros.slope_weight:
+            return found
+        task = self.task
+        way, slope = data.moves(task, np.random.default_rng([_MOVES, number]))
+        ways = np.zeros_like(data.observation)
+        ways[:, task.layout.state] = way
+        # The signs depend on the episode alone.
+        _, signs = seen(self.see, data.observation.astype(np.float32))
+        slope = slope if signs is None else slope * signs
+        along = moved(self.see, data.observation, ways)
+        return found._replace(moves=Moves(along.astype(np.float32), slope.astype(np.float32)))
 
     def _network(
         self,
@@ -270,14 +305,15 @@ class _Making:
         if found is None:
             kept = [_split(part, training.held_out)[0] for part in parts]
             found = fit(
-                np.concatenate([features for features, _, _ in kept]),
-                np.concatenate([labels for _, labels, _ in kept]),
+                np.concatenate([part.features for part in kept]),
+                np.concatenate([part.labels for part in kept]),
                 training,
                 self.folder / f"{name}_checkpoint.safetensors",
                 lambda epoch, _: self.progress(f"train {name}", epoch, training.epochs),
                 self.see.alike,
                 after,
-                len(kept[0][0]),
+                len(kept[0].features),
+                _together([part.moves for part in kept]),
             )
             trained_for = training_of(self.task).range(timed=True)
             found.metadata.update(weights_record(self.task.name, name, trained_for))
@@ -297,16 +333,15 @@ class _Making:
         begun = perf_counter()
         network = self._network(name, training, parts, after)
         halves = [_split(part, training.held_out) for part in parts]
-        features, labels = (
-            np.concatenate([held[index] for _, held in halves]) for index in range(2)
-        )
+        features = np.concatenate([held.features for _, held in halves])
+        labels = np.concatenate([held.labels for _, held in halves])
         error = learning_error(network, features, labels)
         unit = self.task.control_unit
         record: dict[str, Any] = {
             "policy": name,
             "command": f"lagros reproduce {self.settings.task}",
             "training": asdict(training),
-            "samples": sum(len(kept[0]) for kept, _ in halves),
+            "samples": sum(len(kept.features) for kept, _ in halves),
             "learning_error": {**asdict(error), "unit": unit, "kind": "observed"},
         }
         path = _weights(self.folder, self.task, name).with_suffix(".json")
@@ -319,14 +354,34 @@ class _Making:
         )
 
 
-Samples = tuple[Float32Array, Float32Array, IntArray]
+class Samples(NamedTuple):
+    """What a network is fitted to.
+
+    Attributes:
+        features: Shape (s, f).
+        labels: Shape (s, m).
+        plan: Which plan each belongs to, shape (s,).
+        moves: How features and labels move together; None where that is not known or not asked for.
+    """
+
+    features: Float32Array
+    labels: Float32Array
+    plan: IntArray
+    moves: Moves | None = None
 
 
 def _split(part: Samples, share: float) -> tuple[Samples, Samples]:
     """Hold out whole plans: samples of one tube are too much alike to test each other."""
-    features, labels, plan = part
-    held = plan % max(2, round(1.0 / share)) == 0
-    return (
-        (features[~held], labels[~held], plan[~held]),
-        (features[held], labels[held], plan[held]),
-    )
+    held = part.plan % max(2, round(1.0 / share)) == 0
+
+    def taken(which: BoolArray) -> Samples:
+        moves = None if part.moves is None else Moves(*(one[which] for one in part.moves))
+        return Samples(part.features[which], part.labels[which], part.plan[which], moves)
+
+    return taken(~held), taken(held)
+
+
+def _together(parts: Sequence[Moves | None]) -> Moves | None:
+    """Join what is known of the moves of several rounds: of all of them, or of none."""
+    known = [part for part in parts if part is not None]
+    return Moves(*map(np.concatenate, zip(*known, strict=True))) if known else None

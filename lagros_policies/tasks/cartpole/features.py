@@ -31,6 +31,7 @@ class CartPoleView:
         "time [s]",
     )
     alike = None
+    affine = 4
 
     def __init__(self, settings: task.CartPoleSettings | None = None) -> None:
         """Need nothing."""
