@@ -9,6 +9,7 @@ A system states dx/dt once, as a function of numbers. What is passed in decides 
 | `Dual`     | these and their exact derivatives (values may be any of the other kinds) |
 | `Interval` | an enclosure of the rates over a whole box of states                    |
 | `Series`   | enclosures of higher derivatives along one variable                     |
+| `TaylorModel` | polynomials that enclose the rates over a ball of several variables  |
 | `Recorded` | the list of its operations, to be run in buffers, compiled or exported  |
 
 Every kind knows `+ - * /` with its own kind and with floats, the sign, integer powers and `abs`,
@@ -24,5 +25,16 @@ from lagros_envs.numbers.dual import Dual
 from lagros_envs.numbers.interval import Interval, exact
 from lagros_envs.numbers.recorded import Recorded
 from lagros_envs.numbers.series import Series, variable
+from lagros_envs.numbers.taylor import TaylorModel, monomials
 
-__all__ = ["Dual", "Interval", "Recorded", "Series", "exact", "functions", "variable"]
+__all__ = [
+    "Dual",
+    "Interval",
+    "Recorded",
+    "Series",
+    "TaylorModel",
+    "exact",
+    "functions",
+    "monomials",
+    "variable",
+]
