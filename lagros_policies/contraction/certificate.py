@@ -58,6 +58,8 @@ class Certificate:
         unit: Its unit; "" for the norm of the state.
         everywhere: Whether the condition holds for all states, of which the region is a part to
             draw from.
+        headline: What it comes to, in one line; "" for the verdict alone.
+        guarantee: What is guaranteed of episodes, as JSON; None where no statement is about them.
     """
 
     task: str
@@ -80,6 +82,8 @@ class Certificate:
     reach: str = ""
     unit: str = ""
     everywhere: bool = False
+    headline: str = ""
+    guarantee: Mapping[str, Any] | None = None
 
     @property
     def reached(self) -> float | None:
@@ -122,6 +126,7 @@ class Certificate:
                 "certified": _finite(self.tube.certified),
                 "observed": _finite(self.tube.observed),
             },
+            "guarantee": self.guarantee,
             "not_proved": list(self.not_proved),
             "holds": self.holds,
             "statements": [

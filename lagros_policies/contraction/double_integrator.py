@@ -38,7 +38,7 @@ _ROUNDING = 1e-8
 # 0.1 s, at alpha = 1 with the metric of least chi; and the power of 1/alpha.
 _EXPECTED_ERROR = 0.378
 _EXPECTED_POWER = 0.41
-_LEAST_MARGIN = 0.05  # of a plan, for what is not disturbance [m]
+LEAST_MARGIN = 0.05  # of a plan, for what is not disturbance [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +243,7 @@ def planned_margin(margin: float | None, disturbance_bound: float, rate: float) 
     """
     check_disturbance_bound("disturbance_bound", disturbance_bound)
     if margin is None:
-        return max(_LEAST_MARGIN, expected_margin(disturbance_bound, rate))
+        return max(LEAST_MARGIN, expected_margin(disturbance_bound, rate))
     check_not_negative("margin", margin, "or None")
     return margin
 

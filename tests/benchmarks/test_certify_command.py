@@ -22,7 +22,6 @@ from lagros_policies.contraction.metric_files import metric_record
 from lagros_policies.contraction.statement import Statement
 from lagros_policies.expert import metric_of
 from lagros_policies.tasks.cartpole.box import ProofBox
-from lagros_policies.tasks.spacecraft.ellipsoid_axis import AxisEllipsoid, prove_axis_ellipsoid
 
 
 @pytest.fixture
@@ -44,23 +43,44 @@ def quick(monkeypatch):
 def test_the_spacecraft_is_certified_without_flights(invoke, tmp_path):
     result = invoke("spacecraft", "--episodes", "0", "--json", "out/sc.json")
     assert result.exit_code == 0, result.output
-    assert result.stdout.splitlines()[1].startswith("Every claim holds (8 proved, 1 observed); u*")
+    assert "Every claim holds (7 proved); what flies" in " ".join(result.stdout.split())
     assert max(cell_len(line) for line in result.stdout.splitlines()) <= 80
     record = json.loads((tmp_path / "out" / "sc.json").read_text())
     assert record["holds"]
-    assert record["tube"]["observed"] is None
-    assert {line["kind"] for line in record["statements"]} == {"proved", "observed"}
-    # An outsider proves the ellipsoid from the record alone.
-    kept = record["ellipsoid"]
-    tube = AxisEllipsoid(np.array(kept["W"]), np.array(kept["K"]), kept["tau"], kept["hold"])
-    assert prove_axis_ellipsoid(tube)
-    assert tube.position <= kept["position"]
+    assert record["guarantee"] is None
+    assert (record["tube"]["observed"], record["tube"]["certified"]) == (None, None)
+    assert {line["kind"] for line in record["statements"]} == {"proved"}
+    assert record["epsilon_l"] == 0.0
+    # An outsider has the law that flies, and the metric that it contracts, from the record alone.
+    for kept in record["gain"].values():
+        weight, gain, h = np.array(kept["W"]), np.array(kept["K"]), kept["hold"]
+        step = np.array([[1.0, h], [0.0, 1.0]]) + np.outer([0.5 * h * h, h], gain)
+        left = np.exp(-2.0 * kept["alpha"] * h) * weight - step @ weight @ step.T
+        assert np.linalg.eigvalsh(left).min() > -1e-12
 
 
-def test_u_star_itself_has_no_learning_error(invoke, tmp_path):
-    result = invoke("spacecraft", "--policy", "centralized", "--episodes", "0", "--json", "sc.json")
+def test_the_worlds_of_the_spacecraft_are_guaranteed_and_never_contradicted(invoke, tmp_path):
+    arguments = ("--policy", "centralized", "--bound", "0.2", "--episodes", "2")
+    result = invoke("spacecraft", *arguments, "--json", "sc.json")
     assert result.exit_code == 0, result.output
-    assert json.loads((tmp_path / "sc.json").read_text())["epsilon_l"] == 0.0
+    assert result.stdout.startswith("guaranteed for 2 of 2 worlds at d̄ = 0.2: collision-free and")
+    found = json.loads((tmp_path / "sc.json").read_text())["guarantee"]
+    assert (found["collision_free"], found["arriving"], found["without_plan"]) == (2, 2, 0)
+    assert found["search"]["contradicted"] == 0
+    assert 0.95 < found["search"]["share_of_bound"] <= 1.0
+    assert 0.15 < found["arrival_bound"] < 0.2
+
+
+def test_of_the_learned_policy_of_the_spacecraft_nothing_is_proved(invoke, tmp_path):
+    result = invoke("spacecraft", "--policy", "lagros", "--episodes", "2", "--json", "sc.json")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith("nothing is guaranteed of lagros")
+    record = json.loads((tmp_path / "sc.json").read_text())
+    assert record["guarantee"] is None
+    assert record["tube"]["certified"] is None
+    # What is proved is of the metric of its labels: no line with a bound of its error.
+    assert not any("Theorem 1" in line["text"] for line in record["statements"])
+    assert [line["kind"] for line in record["statements"][-2:]] == ["observed", "calibrated"]
 
 
 @pytest.mark.usefixtures("quick")

@@ -12,7 +12,7 @@ from lagros_benchmarks.report.records import summarise
 from lagros_benchmarks.report.tables import csv_text
 from lagros_benchmarks.run.runner import run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings
-from lagros_benchmarks.tasks.spacecraft.claims import position_margin
+from lagros_benchmarks.tasks.spacecraft.claims import position_margin, tracked_with_a_gain
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.double_integrator import certified_margin
@@ -53,7 +53,11 @@ def world(**settings: Any) -> SpacecraftVectorEnv:
 
 def test_the_margin_is_that_of_the_centralised_laws() -> None:
     policy: Any = lagros_policies.make("centralized", world())
-    assert position_margin(policy, 0.4) == certified_margin(policy.tracking.plane, 0.4)
+    assert position_margin(policy, 0.4) == policy.tracking.margin(0.4)
+    least: Any = lagros_policies.make("centralized:least-norm", world())
+    assert position_margin(least, 0.4) == certified_margin(least.tracking.plane, 0.4)
+    assert tracked_with_a_gain(policy)
+    assert not tracked_with_a_gain(least)
     sliding: Any = lagros_policies.make(SLIDING, world())
     assert position_margin(sliding, 0.4) == steady_position_bound(sliding.tracking.plane, 0.4)
 

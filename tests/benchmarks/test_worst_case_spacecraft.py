@@ -152,10 +152,9 @@ def test_statements_need_enough_episodes_for_the_level() -> None:
 
 
 def test_scores_of_the_spacecraft_stay_below_the_certified_margin() -> None:
-    from lagros_policies.contraction.double_integrator import certified_margin
     from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
 
     scores = spacecraft_scores(3, bound=0.4, preset="open", agents=2)
-    margin = certified_margin(CentralizedPolicy(preset="open").tracking.plane, 0.4)
+    margin = CentralizedPolicy(preset="open").tracking.margin(0.4)
     assert np.all(scores.values["position_error"] < margin)
     assert np.all(scores.values["position_error"] > 0.0)

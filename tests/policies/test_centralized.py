@@ -143,8 +143,8 @@ def test_without_a_plan_all_hold_their_positions_and_it_is_counted():
 def test_a_planner_is_asked_once_an_episode():
     env, policy = built(agents=2)
     asked = []
-    plan = policy.planner.plan
-    policy.planner.plan = lambda *args: asked.append(args) or plan(*args)
+    plan = policy.certified.plan
+    policy.certified.plan = lambda *args: asked.append(args) or plan(*args)
     _, _, _, memory = fly(env, policy, seed=5, steps=20)
     assert len(asked) == 1
     env.reset(seed=6)

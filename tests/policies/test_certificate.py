@@ -41,7 +41,6 @@ def spacecraft_of_task():
         design_axis(0.3),
         Spacecraft(),
         disturbance_bound=0.4,
-        learning_error=0.5,
         paper_radius=0.125,
     )
 

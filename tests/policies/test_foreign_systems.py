@@ -41,6 +41,7 @@ from lagros_policies.contraction import (
     tube_design,
     verify_metric,
 )
+from lagros_policies.contraction.axis_gain import AxisGain
 from lagros_policies.contraction.double_integrator import design_axis
 from lagros_policies.proof import bounds, hold, sets
 from lagros_policies.proof import condition as proof_condition
@@ -60,8 +61,14 @@ from lagros_policies.tasks.cartpole.neural import design as neural_design
 from lagros_policies.tasks.cartpole.neural import training as neural_training
 from lagros_policies.tasks.cartpole.region import Region
 from lagros_policies.tasks.spacecraft import certificate as certificate_spacecraft
+from lagros_policies.tasks.spacecraft import (
+    gain_control,
+    sliding,
+    thrusters,
+    world_tube,
+    wrench_control,
+)
 from lagros_policies.tasks.spacecraft import proof as proof_spacecraft
-from lagros_policies.tasks.spacecraft import sliding, thrusters, wrench_control
 from tests.policies.foreign import (
     Pvtol,
     Ramp,
@@ -389,7 +396,8 @@ def cartpole_calls(system: Any) -> Iterator[tuple[Callable[..., Any], Callable[[
 def spacecraft_calls(body: Any) -> Iterator[tuple[Callable[..., Any], Callable[[], Any]]]:
     """Yield what is for the spacecraft alone, and a call of it for another body."""
     plane = design_axis(1.0)
-    axis = lagrangian.SlidingAxis()
+    axis, gain, one = lagrangian.SlidingAxis(), AxisGain.of_rate(2.0), np.ones(1)
+    planned = world_tube.Planned(one, one, one, np.zeros((1, 2)), 1.0)
     state, wrench = np.zeros(6), np.zeros(3)
     certificate = {"disturbance_bound": 0.4, "learning_error": 0.0, "paper_radius": 1.0}
     for function, ask in {
@@ -401,6 +409,9 @@ def spacecraft_calls(body: Any) -> Iterator[tuple[Callable[..., Any], Callable[[
         wrench_control.AxesTracking: lambda f: f(body, plane, plane),
         wrench_control.WrenchTracking: lambda f: f(body, plane, plane),
         sliding.SlidingTracking: lambda f: f(body, axis, axis),
+        gain_control.GainTracking: lambda f: f(body, gain, gain),
+        gain_control.tracking_law: lambda f: f("gain", body, 0.1, 2.0, 0.3),
+        world_tube.world_tube: lambda f: f(body, gain, gain, planned, 0.2, 3),
         proof_spacecraft.control_square: lambda f: f(body),
         proof_spacecraft.prove_spacecraft: lambda f: f(plane, None, body),
         certificate_spacecraft.spacecraft_certificate: lambda f: f(

@@ -101,6 +101,9 @@ def print_certificate(found: Certificate) -> None:
     from rich.text import Text
 
     console = Console(width=_WIDTH, highlight=False)
+    if found.headline:
+        console.print(Text(found.headline, style="bold"))
+        console.print()
     console.print(Text(f"Certificate of {found.task}, policy {found.policy}, d̄ = {found.d_bar:g}"))
     console.print(Text(verdict(found), style="bold"))
     console.print()

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from itertools import islice
+from itertools import islice, pairwise
 
 import numpy as np
 
@@ -43,6 +43,8 @@ class JointPlannerSettings:
         pair_share: Room beyond touching between two agents, in margins.
         margin_growth: Where a start or goal lies inside a margin, the acceleration at which the
             margin grows from what there is, and shrinks towards the goal [m/s^2].
+        margin_profile: Share of the margin that is asked for at the control instants from the start
+            on, not falling, in place of that growth; all of it after the last.
         start_margin: Room beyond touching from the first instant of a plan that may begin beside
             the states; the margin grows from there as above [m].
         speed_limit: Largest speed per axis; a node step at this speed must not cross an agent and
@@ -67,6 +69,7 @@ class JointPlannerSettings:
     margins: tuple[float, ...] = (0.3, 0.15)
     pair_share: float = 1.0
     margin_growth: float = 0.02
+    margin_profile: tuple[float, ...] = ()
     start_margin: float = 0.12
     speed_limit: float = 0.7
     force_limit: float | None = None
@@ -89,6 +92,12 @@ class JointPlannerSettings:
         falling = sorted(self.margins, reverse=True)
         if not self.margins or list(self.margins) != falling or not 0.0 <= falling[-1] < math.inf:
             raise ValueError(f"margins={self.margins!r} must be falling numbers >= 0, at least one")
+        shares = (0.0, *self.margin_profile, 1.0)
+        if not all(one <= other for one, other in pairwise(shares)):
+            raise ValueError(
+                f"margin_profile={self.margin_profile!r} must be shares from 0 to 1 which do not "
+                "fall"
+            )
         divisor("control_period", self.control_period, self.node_period)
         divisor("check_period", self.check_period, self.node_period)
 
@@ -253,6 +262,14 @@ class JointPlanner:
         obstacle_required, pair_required = gaps[1] + left[:, :, None], apart[1] + left_pair
         full_pair = scene.pair_touching + settings.pair_share * margin + spare
         growing, pair_growing = gaps[0] + gone[:, None, None], apart[0] + gone[:, None]
+        if settings.margin_profile:
+            known = (*settings.margin_profile, 1.0)
+            share = np.interp(times, instants(settings.control_period, len(known) - 1), known)
+            room = share * margin + spare
+            growing = (scene.touching + room[:, None])[:, None]
+            pair_growing = (scene.pair_touching + settings.pair_share * share * margin + spare)[
+                :, None
+            ]
         if scene.start_cost is not None:
             # A plan that may begin beside the states does not begin in touch.
             least = min(margin, settings.start_margin)

@@ -11,6 +11,13 @@ POLICIES = {
     "tube-mpc": "lagros_policies.tasks.spacecraft.distributed:DistributedTubeMpcPolicy",
     "lagros": "lagros_policies.tasks.spacecraft.network_policy:SpacecraftLagrosPolicy",
     "centralized": "lagros_policies.tasks.spacecraft.centralized:CentralizedPolicy",
+    "centralized:firm": "lagros_policies.tasks.spacecraft.centralized:FirmCentralizedPolicy",
+    "centralized:ellipsoid": (
+        "lagros_policies.tasks.spacecraft.centralized:EllipsoidCentralizedPolicy"
+    ),
+    "centralized:least-norm": (
+        "lagros_policies.tasks.spacecraft.centralized:LeastNormCentralizedPolicy"
+    ),
     "ppo": "lagros_policies.tasks.spacecraft.ppo:SpacecraftPpoPolicy",
 }
 SPACECRAFT_NAMES = tuple(POLICIES)  # the older name of `policy_names`

@@ -1,4 +1,8 @@
-"""The spacecraft's certificate: for all states, by exact arithmetic and a Schur complement."""
+"""The spacecraft's certificate: for all states, by exact arithmetic and a Schur complement.
+
+What is said of the law that flies is said of the gain of its metric, held. Theorem 1 is for a
+control at will and is a line of the certificate of a metric alone, which nobody flies.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +21,13 @@ from lagros_policies.contraction.double_integrator import (
     state_tube,
 )
 from lagros_policies.contraction.statement import Statement, at_most
-from lagros_policies.contraction.tube import diverging_bound
-from lagros_policies.tasks.spacecraft.ellipsoid_axis import (
-    design_axis_ellipsoid,
-    prove_axis_ellipsoid,
-)
+from lagros_policies.tasks.spacecraft.gain_control import PLAN_ACCELERATION, GainTracking
 from lagros_policies.tasks.spacecraft.proof import (
     contracts_at_will,
     control_square,
     lies_between,
     prove_axis,
+    prove_gain,
     prove_spacecraft,
 )
 
@@ -41,10 +42,11 @@ def spacecraft_certificate(
     body: Spacecraft,
     *,
     disturbance_bound: float,
-    learning_error: float,
     paper_radius: float,
     thrust: float = 1.0,
-    policy: str = "lagros",
+    policy: str = "centralized",
+    law: GainTracking | None = None,
+    learning_error: float = 0.0,
 ) -> Certificate:
     """Return the certificate of a metric of the plane, taken for all three axes.
 
@@ -53,10 +55,13 @@ def spacecraft_certificate(
         turning: Metric that the tracking law has for the heading.
         body: The spacecraft, of any mass and arms; its thrusters push as those of `Spacecraft`.
         disturbance_bound: d_bar, in units of the state per second.
-        learning_error: eps_l, as an acceleration in the plane [m/s^2].
         paper_radius: What the published tube tends to.
         thrust: Largest force of a thruster in u_d [N], which bounds the terms of the heading in A.
-        policy: Whose learning error that is.
+        policy: What flies.
+        law: The law that flies, whose tube is claimed; None for a metric alone, of which Theorem 1
+            and the least-norm u* are, or for a policy that no tube is about.
+        learning_error: Recorded eps_l of a learned policy [m/s^2]. Nothing rests on it, and no tube
+            is claimed where it is not zero.
 
     Raises:
         TypeError: The body is no spacecraft.
@@ -85,10 +90,18 @@ def spacecraft_certificate(
     )
     statements = prove_spacecraft(plane, turning, body)
     watch.lap()
-    tube = state_tube(plane, disturbance_bound + learning_error)
-    radius = tube.steady_radius * (1.0 + 2.0 * _ROUNDING)
-    position = position_tube(plane, disturbance_bound + learning_error)
-    pushed = max(1.0, push)
+    certified, reach, details = None, "", {}
+    lines: list[Statement] = []
+    if law is not None:
+        lines, margin = _of_the_gain(law, disturbance_bound)
+        reach = "what flies, u_d + K e held for 0.1 s, is proved to stay on its plan to"
+        details = {"tubes": {"position_held": margin}, "gain": _gain_record(law)}
+    elif learning_error == 0.0:
+        radius = state_tube(plane, disturbance_bound).steady_radius * (1.0 + 2.0 * _ROUNDING)
+        certified, margin = radius, certified_margin(plane, disturbance_bound)
+        lines = _of_the_metric(plane, disturbance_bound, radius, shown)
+        reach = "the least-norm u*, held for 0.1 s, stays on its plan, but for the turn, to"
+        details = {"tubes": {"position_held": margin}}
     return Certificate(
         task="spacecraft",
         policy=policy,
@@ -102,7 +115,7 @@ def spacecraft_certificate(
         channels="all",
         basis="1 (W_bar is constant); the state is [x, y, heading, vx, vy, spin]",
         coefficients=coefficients[None],
-        tube=TubeSizes(paper_radius, radius),
+        tube=TubeSizes(paper_radius, certified),
         statements=(
             *statements,
             Statement(
@@ -112,22 +125,54 @@ def spacecraft_certificate(
                 shown,
                 watch.lap(),
             ),
-            *_tubes(plane, disturbance_bound, learning_error, radius, shown),
-            _lemma(pushed, disturbance_bound, learning_error),
+            *lines,
         ),
-        verdict_radius=certified_margin(plane, disturbance_bound),
-        reach="u*, held for 0.1 s and without learning error, is proved to stay on its plan to",
+        verdict_radius=margin if reach else None,
+        reach=reach,
         unit="m",
         everywhere=True,
-        details={
-            "tubes": {
-                "position": position.steady_radius,
-                "position_held_without_learning_error": certified_margin(plane, disturbance_bound),
-            },
-            "lipschitz": pushed,
-            "ellipsoid": _ellipsoid_record(plane.period),
-        },
+        details=details,
     )
+
+
+def _of_the_gain(law: GainTracking, bound: float) -> tuple[list[Statement], float]:
+    """Return what is proved of the law that flies, and the bound of the position error [m]."""
+    watch = Stopwatch()
+    lines = [
+        Statement(
+            f"{name}: v = K e, K = [{axis.gain[0]:.6g}, {axis.gain[1]:.6g}], held for "
+            f"{axis.period:g} s, contracts V by exp(-2 alpha h) for every e, alpha = "
+            f"{axis.rate:.4g} (1 - 1e-9) 1/s: u* is this gain, and no projection acts",
+            "proved",
+            prove_gain(axis),
+            watch.lap(),
+        )
+        for name, axis in (("x and y", law.plane), ("heading", law.turning))
+    ]
+    margin = law.margin(bound)
+    tube = Statement(
+        f"that law around plans of at most {PLAN_ACCELERATION:g} m/s^2, e(0) = 0: ||p - p_d|| "
+        f"never exceeds {at_most(margin)} m under d_bar = {bound:g}, at and between the instants, "
+        "with the turn of the body in a hold, the environment's Runge-Kutta steps and single "
+        "precision",
+        "proved",
+        math.isfinite(margin),
+        watch.lap(),
+    )
+    return [*lines, tube], margin
+
+
+def _gain_record(law: GainTracking) -> dict[str, object]:
+    """Return the laws of the axes as what JSON can hold."""
+    return {
+        name: {
+            "K": axis.gain.tolist(),
+            "W": axis.dual.tolist(),
+            "alpha": axis.rate,
+            "hold": axis.period,
+        }
+        for name, axis in (("plane", law.plane), ("heading", law.turning))
+    }
 
 
 def control_weight(metric: AxisMetric, gain: float, push: float) -> float:
@@ -179,41 +224,30 @@ def _region(thrust: float) -> dict[str, tuple[float, float]]:
     }
 
 
-def _tubes(
-    plane: AxisMetric, bound: float, learning_error: float, radius: float, contracts: bool
+def _of_the_metric(
+    plane: AxisMetric, bound: float, radius: float, contracts: bool
 ) -> list[Statement]:
-    """Return the tubes; `contracts` says whether (14) was shown, which Theorem 1 stands on."""
+    """Return Theorem 1 and the held u*; `contracts` says whether (14) was shown."""
     watch = Stopwatch()
-    whole = bound + learning_error
-    reach = position_tube(plane, whole).steady_radius * (1.0 + 2.0 * _ROUNDING)
+    reach = position_tube(plane, bound).steady_radius * (1.0 + 2.0 * _ROUNDING)
     first = Statement(
         f"Theorem 1, control at will: ||e|| of the plane's four states tends to at most "
-        f"{at_most(radius)}, its position error to {at_most(reach)} m, for d_bar = {bound:g} and "
-        f"||u_L - u*|| <= {at_most(learning_error)} m/s^2",
+        f"{at_most(radius)}, its position error to {at_most(reach)} m, for d_bar = {bound:g} "
+        "and u* itself",
         "proved",
-        contracts and _radii_hold(plane, whole, radius, reach),
+        contracts and _radii_hold(plane, bound, radius, reach),
         watch.lap(),
     )
     margin = certified_margin(plane, bound)
     second = Statement(
-        f"u* held for {plane.period:g} s, without learning error, e(0) = 0: the position error "
-        f"never exceeds {at_most(margin)} m under d_bar = {bound:g}, at and between the instants "
-        "(of a wrench that keeps its direction while the body turns)",
+        f"least-norm u* held for {plane.period:g} s, e(0) = 0: the position error never exceeds "
+        f"{at_most(margin)} m under d_bar = {bound:g}, at and between the instants (of a wrench "
+        "that keeps its direction while the body turns)",
         "proved",
         prove_axis(plane).holds,
         watch.lap(),
     )
-    ellipsoid = design_axis_ellipsoid(plane.period, "state")
-    widest = at_most(ellipsoid.position * bound * (1.0 + _ROUNDING))
-    third = Statement(
-        f"invariant ellipsoid, v = K e held for {plane.period:g} s with K = "
-        f"{ellipsoid.gain.round(4).tolist()} (rounded), without learning error, e(0) = 0: the "
-        f"position error never exceeds {widest} m under d_bar = {bound:g} (likewise)",
-        "proved",
-        prove_axis_ellipsoid(ellipsoid),
-        watch.lap(),
-    )
-    return [first, second, third]
+    return [first, second]
 
 
 def _radii_hold(plane: AxisMetric, push: float, radius: float, reach: float) -> bool:
@@ -229,29 +263,4 @@ def _radii_hold(plane: AxisMetric, push: float, radius: float, reach: float) -> 
     least, largest = steady / Fraction(reach) ** 2, 1 + Fraction(plane.stiffness)
     return Fraction(radius) ** 2 >= Fraction(condition) * steady and lies_between(
         plane.dual, least, largest
-    )
-
-
-def _ellipsoid_record(period: float) -> dict[str, object]:
-    """Return the ellipsoid as what JSON can hold; `position` is per unit of d_bar."""
-    found = design_axis_ellipsoid(period, "state")
-    return {
-        "W": found.dual.tolist(),
-        "K": found.gain.tolist(),
-        "tau": found.share,
-        "hold": found.period,
-        "position": found.position * (1.0 + _ROUNDING),
-    }
-
-
-def _lemma(lipschitz: float, bound: float, learning_error: float) -> Statement:
-    watch = Stopwatch()
-    at = diverging_bound(np.array([1.0, 10.0]), lipschitz, bound + learning_error)
-    return Statement(
-        f"Lemma 1, e(0) = 0: L_f <= {at_most(lipschitz)} 1/s for all states, so that without "
-        f"feedback ||e|| is bounded by {at_most(at[0], 3)} after 1 s and by {at_most(at[1], 3)} "
-        "after 10 s only",
-        "proved",
-        True,
-        watch.lap(),
     )

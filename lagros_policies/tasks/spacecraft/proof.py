@@ -20,6 +20,7 @@ from typing import Any
 
 from lagros_envs.arrays import FloatArray
 from lagros_envs.tasks.spacecraft.physics import HEADING, VELOCITY_X, Spacecraft, check_spacecraft
+from lagros_policies.contraction.axis_gain import AxisGain
 from lagros_policies.contraction.double_integrator import AxisMetric
 from lagros_policies.contraction.statement import Statement, at_most
 
@@ -91,6 +92,33 @@ def prove_axis(metric: AxisMetric) -> AxisProof:
     definite = stiffness > coupling**2
     condition = _condition_above(coupling, stiffness) if definite else float("inf")
     return AxisProof(float(rate), metric.period, bool(contracts and definite), condition)
+
+
+def prove_gain(gain: AxisGain) -> bool:
+    """Return whether K contracts its W over a hold for every e, exactly.
+
+    With A = F + g K that is exp(-2 alpha h) W - A W A' >= 0, for alpha (1 - 1e-9).
+
+    Args:
+        gain: The gain, whose W and rate are taken as they are written.
+    """
+    h, k = Fraction(gain.period), [Fraction(entry) for entry in gain.gain.tolist()]
+    dual = [[Fraction(entry) for entry in row] for row in gain.dual.tolist()]
+    push = (h * h / 2, h)
+    step = [[1 + push[0] * k[0], h + push[0] * k[1]], [push[1] * k[0], 1 + push[1] * k[1]]]
+    decay = _exponential_below(2 * Fraction(gain.rate) * (1 - _SHORTFALL) * h)
+    left = [
+        [
+            decay * dual[i][j]
+            - sum(step[i][k] * dual[k][m] * step[j][m] for k in range(2) for m in range(2))
+            for j in range(2)
+        ]
+        for i in range(2)
+    ]
+    definite = dual[0][0] > 0 and dual[0][0] * dual[1][1] > dual[0][1] * dual[1][0]
+    symmetric = dual[0][1] == dual[1][0]
+    kept = min(left[0][0], left[1][1]) >= 0 and left[0][0] * left[1][1] >= left[0][1] * left[1][0]
+    return bool(gain.rate > 0.0 and symmetric and definite and kept)
 
 
 def prove_spacecraft(

@@ -15,7 +15,7 @@ from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.policy import make
 
 POSITION_ERROR = Score(
-    "position_error", "the largest ||p - p_d|| of any agent of a world (centralised, u*)", "m"
+    "position_error", "the largest ||p - p_d|| of any agent of a world (centralised)", "m"
 )
 # Worlds that fly in one batch.
 _WORLDS = 25
@@ -29,8 +29,9 @@ def spacecraft_scores(
     bound: float = 0.4,
     preset: str = "paper",
     agents: int = 6,
+    policy: str = "centralized",
 ) -> EpisodeScores:
-    """Fly worlds of the centralised policy and return the largest position error of each.
+    """Fly worlds of a centralised policy and return the largest position error of each.
 
     See `evidence.calibration.single_scores`; preset and agents are those of the worlds.
     """
@@ -39,11 +40,11 @@ def spacecraft_scores(
     def worlds(number: int) -> SpacecraftVectorEnv:
         return make_worlds(number, agents, preset, kind, bound)
 
-    policy: Any = make("centralized", worlds(1))
+    flown: Any = make(policy, worlds(1))
     seeds = episode_seeds(seed, count, namespace)
     scores = []
     for at in range(0, count, _WORLDS):
-        for world in fly_chunk(worlds, policy, seeds[at : at + _WORLDS]).worlds:
+        for world in fly_chunk(worlds, flown, seeds[at : at + _WORLDS]).worlds:
             errors = [agent.max_position_error for agent in world.agents]
             whole = world.error is None and world.planned and None not in errors
             scores.append(max(e for e in errors if e is not None) if whole else np.inf)
