@@ -139,12 +139,45 @@ def expand(network: Mlp, inputs: Expansion) -> Expansion:
     return found
 
 
+def evaluated(network: Mlp, inputs: FloatArray) -> tuple[Interval, FloatArray]:
+    """Enclose what the layers of a network give at points, and what single precision rounds.
+
+    Args:
+        network: The network.
+        inputs: Numbers of single precision, shape (..., inputs).
+
+    Returns:
+        The outputs of the last layer, of real numbers, and by how much those that are evaluated in
+        single precision, in whatever order sums are taken, may differ, (..., outputs).
+    """
+    values, rounding = exact(inputs), np.zeros(inputs.shape)
+    layers = list(zip(network.weights, network.biases, strict=True))
+    for index, (weight, bias) in enumerate(layers):
+        rounding = _rounded(values, rounding, weight, bias)
+        values = linear(values, np.asarray(weight, float), np.asarray(bias, float))
+        if index < len(layers) - 1:
+            _, near, _ = tanh_derivatives(values + symmetric(rounding))
+            values, _, _ = tanh_derivatives(values)
+            rounding = near.upper * rounding + _TANH_ERROR_32 * abs(values).upper + _TINY_32
+    return values, above(rounding)
+
+
+def _rounded(
+    values: Interval,
+    rounding: FloatArray,
+    weight: NDArray[np.floating],
+    bias: NDArray[np.floating],
+) -> FloatArray:
+    """Bound what single precision makes of a layer, of inputs that it knew to `rounding`."""
+    sizes, offset = np.abs(np.asarray(weight, float)), np.abs(np.asarray(bias, float))
+    share = (len(sizes) + 2) * _UNIT_32 * (1.0 + 2.0**-10)
+    reached = abs(values).upper + rounding
+    bound: FloatArray = above(rounding @ sizes + share * (reached @ sizes + offset) + _TINY_32)
+    return bound
+
+
 def _layer(given: Expansion, weight: NDArray[np.floating], bias: NDArray[np.floating]) -> Expansion:
     matrix, offset = np.asarray(weight, float), np.asarray(bias, float)
-    sizes = np.abs(matrix)
-    share = (len(matrix) + 2) * _UNIT_32 * (1.0 + 2.0**-10)
-    reached = abs(given.values).upper + given.rounding
-    rounding = given.rounding @ sizes + share * (reached @ sizes + np.abs(offset)) + _TINY_32
     return Expansion(
         given.centre,
         given.reach,
@@ -153,7 +186,7 @@ def _layer(given: Expansion, weight: NDArray[np.floating], bias: NDArray[np.floa
         linear(given.values, matrix, offset),
         linear(given.slopes, matrix),
         linear(given.curves, matrix),
-        above(rounding),
+        _rounded(given.values, given.rounding, weight, bias),
     ).narrowed()
 
 
