@@ -50,6 +50,8 @@ def built(preset="paper", agents=3, bound=0.0, **arguments):
     """Return environment and policy of one task."""
     kind = "uniform" if bound else "none"
     env = spacecraft_v0.parallel_env(agents, preset, disturbance=kind, disturbance_bound=bound)
+    # A busy machine makes no plan late here.
+    arguments.setdefault("deadline", 1e9)
     return env, DistributedTubeMpcPolicy(env.settings, preset, agents, bound, **arguments)
 
 
@@ -281,3 +283,52 @@ def test_wrong_observations_get_clear_errors():
         policy.predict(row, memory)
     with pytest.raises(ValueError, match="episode_start"):
         policy.predict(row, None, np.zeros(3, bool))
+
+
+class Clock:
+    """A clock that advances by `lag` whenever it is looked at."""
+
+    def __init__(self, lag):
+        self.lag, self.now = lag, 0.0
+
+    def __call__(self):
+        self.now += self.lag
+        return self.now
+
+
+def test_a_plan_that_comes_late_is_counted_and_the_last_one_stays_in_force():
+    clock = Clock(0.0)
+    policy = DistributedTubeMpcPolicy(replan_every=1, kept_for=0.0, clock=clock)
+    row = observation(policy.layout, (2.0, 0.0))
+    _, first = policy.predict(row)
+    clock.lag = policy.settings.control_period * 1.01
+    later = observation(policy.layout, (2.0, 0.0), time=0.1)
+    action, second = policy.predict(later, first)
+    assert second[0].plan is first[0].plan
+    assert second[0].age == 1
+    assert np.all(np.isfinite(action))
+    counted = policy.counters(second)
+    assert (counted["plans"], counted["late_plans"], counted["failed_plans"]) == (2, 1, 0)
+    clock.lag = policy.settings.control_period * 0.99
+    _, third = policy.predict(observation(policy.layout, (2.0, 0.0), time=0.2), second)
+    assert third[0].plan is not first[0].plan
+    assert policy.counters(third)["late_plans"] == 1
+    # What was returned before stays what it was.
+    assert policy.counters(first)["late_plans"] == 0
+
+
+def test_the_first_plan_is_waited_for():
+    clock = Clock(10.0)
+    policy = DistributedTubeMpcPolicy(deadline=1.0, clock=clock)
+    _, memory = policy.predict(observation(policy.layout, (2.0, 0.0)))
+    assert memory[0].plan is not None
+    assert policy.counters(memory)["late_plans"] == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [({"deadline": 0.0}, "deadline"), ({"clock": 1.0}, "clock"), ({"law": "pid"}, "law='pid'")],
+)
+def test_a_deadline_a_clock_or_a_law_that_is_none_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        DistributedTubeMpcPolicy(**arguments)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
 from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
-from lagros_envs.checks import check_instance, check_not_negative, check_whole
+from lagros_envs.checks import check_above, check_instance, check_not_negative, check_whole, shown
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import Layout
@@ -19,6 +22,7 @@ from lagros_policies.planning.local.motion import Discs, LocalPlan
 from lagros_policies.planning.local.plan import LocalPlanner
 from lagros_policies.planning.local.problem import LocalPlannerSettings
 from lagros_policies.policy import BasePolicy, PolicyState, row_memories
+from lagros_policies.tasks.spacecraft.gain_control import tracking_law
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.setup import (
     PAIR_SHARE,
@@ -27,7 +31,6 @@ from lagros_policies.tasks.spacecraft.setup import (
     plan_force_limit,
     task_and_preset,
 )
-from lagros_policies.tasks.spacecraft.wrench_control import WrenchTracking
 
 # A neighbour slower than this [m/s] is taken to rest, plus this for each unit of the bound: what is
 # left of the disturbance in a smoothed velocity.
@@ -52,6 +55,7 @@ class DistributedState:
         confirmed_plans: Times that the plan in force was found to hold, and kept.
         infeasible_plans: Plans that fall short of a distance that they were asked to keep.
         broken_plans: Plans for which the solver found nothing; the last one stayed in force.
+        late_plans: Plans that took longer than the deadline; the last one stayed in force.
         closest: Least distance to the goal so far [m], in steps of what counts as progress.
         closest_time: When it got there [s].
         stuck: Whether it has not come closer for some seconds, short of the goal.
@@ -67,6 +71,7 @@ class DistributedState:
     confirmed_plans: int = 0
     infeasible_plans: int = 0
     broken_plans: int = 0
+    late_plans: int = 0
     closest: float = math.inf
     closest_time: float = 0.0
     stuck: bool = False
@@ -107,13 +112,20 @@ class DistributedTubeMpcPolicy(BasePolicy):
         kept_for: A plan older than this is renewed though it holds [s]; 0 renews it at every look.
         smoothing: Time constant of the filter of neighbours' positions and velocities [s].
         planner: The planner; its mass must be that of the task.
+        law: How u* answers an error, a name of `gain_control.LAWS`; None for the policy's own.
+        deadline: Delta t_max, after which a plan is late: the last one stays in force, and the late
+            one is counted and dropped. An agent that has none yet waits for its first [s]. None for
+            the control period.
+        clock: Source of the time, for tests [s].
 
     Raises:
-        ValueError: A value is out of range, or the thrust limit leaves plans no force.
+        ValueError: A value is out of range, there is no such law, or the thrust limit leaves plans
+            no force.
     """
 
     name = "tube-mpc"
     prepared = True  # `policy.make` tells it the bound of the environment's disturbance
+    own_law: ClassVar[str] = "gain"
 
     def __init__(
         self,
@@ -128,14 +140,24 @@ class DistributedTubeMpcPolicy(BasePolicy):
         kept_for: float = 0.7,
         smoothing: float = 0.7,
         planner: LocalPlannerSettings | None = None,
+        law: str | None = None,
+        deadline: float | None = None,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
         check_whole("replan_every", replan_every)
-        for name, time in (("kept_for", kept_for), ("smoothing", smoothing)):
-            check_not_negative(name, time)
+        for name, value in (("kept_for", kept_for), ("smoothing", smoothing)):
+            check_not_negative(name, value)
         body, period = self.settings.system, self.settings.control_period
-        self.tracking = WrenchTracking.for_rates(body, period, contraction_rate, turning_rate)
+        self.deadline = period if deadline is None else deadline
+        check_above("deadline", self.deadline, 0)
+        if not callable(clock):
+            raise ValueError(f"clock={shown(clock)} must be a function that returns seconds")
+        self._clock = clock
+        self.tracking = tracking_law(
+            self.own_law if law is None else law, body, period, contraction_rate, turning_rate
+        )
         self.margin = planned_margin(margin, disturbance_bound, contraction_rate)
         self.replan_every, self.kept_for, self.smoothing = replan_every, kept_for, smoothing
         self.still = _STILL + _STILL_NOISE * disturbance_bound
@@ -190,10 +212,11 @@ class DistributedTubeMpcPolicy(BasePolicy):
         """Return what happened, added up over the agents of a state.
 
         `plans` were asked for; `confirmed_plans` are the times that one still held and was kept;
-        `failed_plans` fell short of a distance or were not found; `stuck` agents are stuck now;
+        `failed_plans` fell short of a distance or were not found; `late_plans` missed the deadline;
+        `stuck` agents are stuck now;
         `stuck_steps` are the control steps that agents spent stuck.
         """
-        names = ("plans", "confirmed_plans", "failed_plans", "stuck", "stuck_steps")
+        names = ("plans", "confirmed_plans", "failed_plans", "late_plans", "stuck", "stuck_steps")
         return {name: sum(int(getattr(memory, name)) for memory in state) for name in names}
 
     def _follow(
@@ -260,10 +283,15 @@ class DistributedTubeMpcPolicy(BasePolicy):
         if last is not None:
             start = np.concatenate([part[0] for part in last.at(np.array([elapsed]))])
         fresh = memory.plans % _FRESH_EVERY == 0
+        begun = self._clock()
         plan = self.planner.plan(start, np.zeros(2), discs, left, last, elapsed, fresh)
+        late = self._clock() - begun > self.deadline
         memory.plans += 1
+        memory.late_plans += late
         if not plan.solved:
             memory.broken_plans += 1
+            return
+        if late and last is not None:
             return
         memory.infeasible_plans += plan.short > self.planner.settings.tolerance
         memory.plan, memory.age = plan, 0
@@ -285,3 +313,10 @@ class DistributedTubeMpcPolicy(BasePolicy):
             np.repeat([self.margin, PAIR_SHARE * self.margin], counts),
             np.concatenate([np.zeros(counts[0], bool), moving]),
         )
+
+
+class LeastNormTubeMpcPolicy(DistributedTubeMpcPolicy):
+    """The same with Theorem 2's least-norm u* of the metric of least chi."""
+
+    name = "tube-mpc:least-norm"
+    own_law = "least-norm"
