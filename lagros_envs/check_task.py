@@ -113,6 +113,10 @@ def _check_shapes(task: Task) -> None:
     if task.feedback is not None:
         _numbers("feedback.state_weights", task.feedback.state_weights, n, "state", False)
         _numbers("feedback.control_weights", task.feedback.control_weights, m, "control", False)
+        _numbers("feedback.early_state", task.feedback.early_state, n, "state")
+        _numbers("feedback.early_control", task.feedback.early_control, m, "control")
+        check_positive("feedback.rate", task.feedback.rate)
+        check_positive("feedback.settling", task.feedback.settling)
 
 
 def _check_parts(task: Task) -> None:

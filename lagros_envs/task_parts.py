@@ -42,15 +42,28 @@ class MetricDesign:
 
 @dataclass(frozen=True)
 class Feedback:
-    """What u* prefers where contraction leaves a choice: a regulator along the plan.
+    """Weights of the law along a plan and of the regulators, and how fast the law contracts.
+
+    The law along a plan is the gain of the metric that a discounted Riccati recursion gives
+    (`lagros_policies.contraction.along_plan`). Its weights may begin elsewhere than they settle:
+    at a time t each is its own times exp(s exp(-t / settling)), s its entry of `early_state` or
+    `early_control`. Weights of the control that begin high are gentle where a tube is still narrow.
 
     Attributes:
         state_weights: Diagonal of Q, shape (n,).
         control_weights: Diagonal of R, shape (m,).
+        rate: Contraction rate alpha of the law along a plan [1/s].
+        early_state: Logarithm of what Q begins with, in units of Q, shape (n,); () for zeros.
+        early_control: Likewise of R, shape (m,).
+        settling: Time over which the weights settle [s].
     """
 
     state_weights: Numbers
     control_weights: Numbers
+    rate: float = 0.5
+    early_state: Numbers = ()
+    early_control: Numbers = ()
+    settling: float = 0.5
 
 
 @dataclass(frozen=True)

@@ -1,48 +1,67 @@
-"""The expert that policy (b) runs online and policy (c) imitates: plan, then track with u*.
+"""The expert that policy (b) runs online and policy (c) imitates: plan, then track with a law.
 
-Theorem 2 takes, among the controls that make e'Me contract, the one nearest to u_d. Any other point
-of that set keeps the bound of Theorem 1, so u* may prefer a better one: here the nearest to what a
-regulator along the plan would do.
+The law that is shipped is the gain that belongs to the metric along the plan
+(`contraction.along_plan`). Others are there by name, to be held against it; see `LAWS`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 
 from lagros_envs.aliases import moved_names
 from lagros_envs.arrays import FloatArray, IntArray
+from lagros_envs.checks import shown, suggestion
 from lagros_envs.dynamics import linearise_hold
 from lagros_envs.task import Feedback, Task
-from lagros_policies.baselines import regulator_weights
+from lagros_policies.baselines import bryson_weights, regulator_weights
 from lagros_policies.contraction import ContractionMetric, HeldControl, load_metric
+from lagros_policies.contraction.along_plan import plan_metric, stage_weights
+from lagros_policies.contraction.control import contracting_set, nearest_contracting
 from lagros_policies.contraction.feedback import riccati_gains
 from lagros_policies.planning.planner import planner_of
 from lagros_policies.room import found_file, part_of, reproducing, shipped_file
 
 moved_names(__name__)
 
+# What the laws along a plan make of the rate and the weights that a task names.
+_ALONG: dict[str, Callable[[Task], Feedback]] = {
+    "gain": lambda task: bryson_weights(task),
+    "projected": lambda task: bryson_weights(task),
+    "half-rate": lambda task: _at_rate(bryson_weights(task), 0.5),
+    "double-rate": lambda task: _at_rate(bryson_weights(task), 2.0),
+    "lqr": lambda task: regulator_weights(task),
+}
+# The laws within a contraction metric of the task.
+WITHIN_METRIC = ("least-norm", "tuned")
+LAWS = (*_ALONG, *WITHIN_METRIC)
+SHIPPED_LAW = "gain"
+
 
 @dataclass(frozen=True)
 class TrackedPlans:
-    """Target trajectories with all that u* needs along them.
+    """Target trajectories with all that a law needs along them.
 
     Attributes:
         states: x_d, shape (p, N + 1, n).
         controls: u_d, shape (p, N, m).
         first_step: Control step at which the plans begin.
-        gains: The preferred feedback along the plans.
-        feedback: K of shape (p, N, m, n) where the flown law is u_d + K (x - x_d); None where it
-            is no linear gain.
+        feedback: K of u = u_d + K e where that is the law, shape (p, N, m, n); None elsewhere. A
+            projected gain is the gain wherever it contracts.
+        matrices: M of the same program, shape (p, N + 1, n, n); None where there is none.
+        gains: The preferred feedback along the plans, of the law "tuned"; None elsewhere.
     """
 
     states: FloatArray
     controls: FloatArray
     first_step: int
-    gains: Any
     feedback: FloatArray | None = None
+    matrices: FloatArray | None = None
+    gains: Any = None
 
 
 class Preference(Protocol):
@@ -127,14 +146,28 @@ def metric_of(task: Task) -> ContractionMetric:
 class Expert:
     """Planner and tracking law of a task.
 
+    Laws along a plan, of any task:
+
+    - "gain": u_d + K e, with the gain of the metric along the plan; shipped.
+    - "projected": the same, moved to the nearest control that contracts in that metric.
+    - "half-rate", "double-rate": "gain" of the metric with half and twice the rate.
+    - "lqr": a plain regulator along the plan, of no metric.
+
+    Laws within the metric that CV-STEM has designed for the task:
+
+    - "least-norm": the least deviation that contracts over the hold, equation (17).
+    - "tuned": the contracting deviation nearest to a preference.
+
     Args:
         task: The task.
-        metric: The contraction metric; the task's own if left out.
-        preference: What u* prefers where contraction leaves a choice; the task's if left out.
+        metric: The contraction metric of the task; its own if left out.
+        preference: What "tuned" prefers; the task's if left out.
+        law: One of `LAWS`; if left out, "tuned" with a preference and the shipped one without.
 
     Raises:
-        FileNotFoundError: The task's metric has not been made.
-        ValueError: The task has no metric, or it is one of another system.
+        FileNotFoundError: The law needs the task's metric, which has not been made.
+        ValueError: The law is not known, or needs a metric and the task has none, or it is one of
+            another system.
     """
 
     def __init__(
@@ -142,23 +175,54 @@ class Expert:
         task: Task,
         metric: ContractionMetric | None = None,
         preference: Preference | None = None,
+        law: str | None = None,
     ) -> None:
         self.task = task
-        self.metric: ContractionMetric = metric_of(task) if metric is None else metric
-        self.preference: Preference = preference or part_of(
-            task, "PREFERENCE", "lagros_policies.expert:Regulator"
-        )(task)
+        self.law_name = law or (SHIPPED_LAW if preference is None else "tuned")
+        if self.law_name not in LAWS:
+            raise ValueError(
+                f"law={shown(law)} is not known; use one of {', '.join(LAWS)}."
+                f"{suggestion(law, LAWS)}"
+            )
+        if preference is not None and self.law_name != "tuned":
+            raise ValueError(f"law={law!r} prefers nothing: leave out preference, or law")
+        self._metric, self._preference = metric, preference
         self.planner = planner_of(task)
-        self.law = HeldControl(
-            task.system, self.metric, self.metric.contraction_rate, task.control_period
-        )
+        along = _ALONG.get(self.law_name)
+        self._weights = None if along is None else along(task)
         bounds = np.array([task.control_low, task.control_high], np.float64)
         self._bounds = None if np.all(np.isinf(bounds)) else bounds
+        if self._weights is None:
+            _ = self.law  # a metric that is missing is said here, not in flight
+
+    @cached_property
+    def metric(self) -> ContractionMetric:
+        """The metric that CV-STEM has designed for the task.
+
+        Raises:
+            FileNotFoundError: It has not been made.
+            ValueError: The task describes none, or it is one of another system.
+        """
+        return metric_of(self.task) if self._metric is None else self._metric
+
+    @cached_property
+    def preference(self) -> Preference:
+        """What "tuned" prefers where the task's metric leaves a choice."""
+        found: Preference = self._preference or part_of(
+            self.task, "PREFERENCE", "lagros_policies.expert:Regulator"
+        )(self.task)
+        return found
+
+    @cached_property
+    def law(self) -> HeldControl:
+        """u* of Theorem 2 in the task's metric, for the control that is held."""
+        rate = self.metric.contraction_rate
+        return HeldControl(self.task.system, self.metric, rate, self.task.control_period)
 
     @property
     def feedback(self) -> Any:
-        """The weights of what u* prefers."""
-        return self.preference.settings
+        """The weights of the law."""
+        return self.preference.settings if self._weights is None else self._weights
 
     def track(self, states: FloatArray, controls: FloatArray, first_step: int = 0) -> TrackedPlans:
         """Prepare plans for tracking.
@@ -168,16 +232,24 @@ class Expert:
             controls: u_d, shape (p, N, m).
             first_step: Control step at which the plans begin.
         """
+        if self.law_name == "least-norm":
+            return TrackedPlans(states, controls, first_step)
         period = self.task.control_period
         _, by_state, by_control = linearise_hold(self.task.system, states[:, :-1], controls, period)
         times = period * np.arange(first_step, first_step + states.shape[1])
-        gains = self.preference.gains(by_state, by_control, times)
-        return TrackedPlans(states, controls, first_step, gains)
+        if self._weights is None:
+            gains = self.preference.gains(by_state, by_control, times)
+            return TrackedPlans(states, controls, first_step, gains=gains)
+        plain = self.law_name == "lqr"
+        state, control = stage_weights(self._weights, None if plain else times, len(times))
+        decay = 0.0 if plain else self._weights.rate * period
+        found = plan_metric(by_state, by_control, state, control, decay)
+        return TrackedPlans(states, controls, first_step, found.gains, found.matrices)
 
     def control(
         self, plans: TrackedPlans, plan: IntArray, step: IntArray, state: FloatArray
     ) -> FloatArray:
-        """Return u* at states of episodes that follow prepared plans, within the task's bounds.
+        """Return the law's u at states of episodes that follow plans, within the task's bounds.
 
         Args:
             plans: The plans.
@@ -186,7 +258,7 @@ class Expert:
             state: x, shape (s, n).
 
         Returns:
-            u*, shape (s, m).
+            u, shape (s, m).
         """
         return self.applied(self.wanted(plans, plan, step, state))
 
@@ -197,17 +269,50 @@ class Expert:
     def wanted(
         self, plans: TrackedPlans, plan: IntArray, step: IntArray, state: FloatArray
     ) -> FloatArray:
-        """Return u* whatever the bounds of the control are; see `control`."""
+        """Return the law's u whatever the bounds of the control are; see `control`."""
         index = step - plans.first_step
         nominal, nominal_control = plans.states[plan, index], plans.controls[plan, index]
-        preferred = self.preference.deviation(
-            plans.gains,
-            plan,
-            index,
-            state - nominal,
-            step.astype(np.float64) * self.task.control_period,
-        )
+        error, preferred = state - nominal, np.zeros(len(state))
+        if plans.feedback is not None:
+            deviation = np.einsum("smi,si->sm", plans.feedback[plan, index], error)
+            if self.law_name != "projected":
+                moved: FloatArray = nominal_control + deviation
+                return moved
+            return self._projected(plans, plan, index, state, deviation)
+        if plans.gains is not None:
+            time = step.astype(np.float64) * self.task.control_period
+            preferred = self.preference.deviation(plans.gains, plan, index, error, time)
+        elif nominal_control.shape[-1] > 1:
+            preferred = np.zeros_like(nominal_control)
         if len(state) == 1:
             # One state alone is integrated in plain floats.
             return self.law(state[0], nominal[0], nominal_control[0], preferred[0])[None]
         return self.law(state, nominal, nominal_control, preferred)
+
+    def _projected(
+        self,
+        plans: TrackedPlans,
+        plan: IntArray,
+        index: IntArray,
+        state: FloatArray,
+        deviation: FloatArray,
+    ) -> FloatArray:
+        """Return u_d plus the nearest v to a deviation that contracts in the plan's metric."""
+        task, weights, matrices = self.task, self._weights, plans.matrices
+        assert weights is not None and matrices is not None
+        place = state, plans.states[plan, index], plans.controls[plan, index]
+        here, ahead = matrices[plan, index], matrices[plan, index + 1]
+        if len(state) == 1:
+            place, here, ahead = (place[0][0], place[1][0], place[2][0]), here[0], ahead[0]
+            deviation = deviation[0]
+        condition = contracting_set(
+            task.system, task.control_period, weights.rate, place, here, lambda *_: ahead
+        )
+        single = task.system.control_dim == 1
+        v = nearest_contracting(*condition, deviation[..., 0] if single else deviation)
+        control: FloatArray = place[2] + v
+        return control[None] if control.ndim == 1 else control
+
+
+def _at_rate(weights: Feedback, share: float) -> Feedback:
+    return replace(weights, rate=share * weights.rate)

@@ -38,6 +38,15 @@ _SINGLE = {
     "td3": "lagros_policies.actor:Td3Policy",
     "residual": "lagros_policies.residual:ResidualPolicy",
 }
+# Other laws around the plan of "tube-mpc", to be held against the shipped one.
+_OTHER_LAWS = {
+    **{
+        f"tube-mpc:{law}": law
+        for law in ("gain", "projected", "half-rate", "double-rate", "least-norm", "tuned")
+    },
+    "lqr-plan": "lqr",
+}
+_SINGLE |= dict.fromkeys(_OTHER_LAWS, _SINGLE["tube-mpc"])
 NAMES = tuple(_SINGLE)
 moved_names(__name__)
 
@@ -324,13 +333,15 @@ def make(
     if told is not None:
         settings = told(world, settings)
     if name in classes:
+        if task.most_agents == 1 and name in _OTHER_LAWS:
+            settings = {"law": _OTHER_LAWS[name], **settings}
         return _shipped(name, classes[name], world, allow_other_settings, settings)
     model = model_file(name)
     if model is not None:
         from lagros_policies.sb3_model import load_stable_baselines3
 
         return load_stable_baselines3(model.path, model.algorithm, task, **settings)
-    own = user_class(name)
+    own = None if name.partition(":")[0] in classes else user_class(name)
     if own is not None:
         return _built(_class_named(name, own), world, allow_other_settings, settings)
     raise ValueError(

@@ -15,7 +15,7 @@ from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.checks import check_above, check_not_negative, check_whole, shown
 from lagros_envs.task import Task
 from lagros_policies.contraction import ContractionMetric, load_metric
-from lagros_policies.expert import Expert, TrackedPlans
+from lagros_policies.expert import WITHIN_METRIC, Expert, TrackedPlans
 from lagros_policies.observed import observed_rows
 from lagros_policies.planning import Trajectory
 from lagros_policies.policy import BasePolicy, PolicyState, row_memories
@@ -55,7 +55,7 @@ class TubeMpcState:
 
 
 class TubeMpcPolicy(BasePolicy):
-    """Online tube MPC with the CV-STEM control u* around the plan.
+    """Online tube MPC: a plan, and the law of `Expert` around it.
 
     A plan is made when there is none and when the goal or the discs have moved, over the horizon
     that is left: the rest of a plan of least effort is the plan of least effort from x_d(t), so
@@ -71,12 +71,15 @@ class TubeMpcPolicy(BasePolicy):
 
     Args:
         settings: The task; None for the paper's.
-        metric: The contraction metric, or its file; the task's own if left out.
+        metric: The contraction metric, or its file, in which u* is to contract; if left out, that
+            along the plan, or the task's own where the law needs it.
         replan_every: Control steps between plans that nothing calls for; None for none of them.
         deadline: Delta t_max, after which a plan is late [s]; None for the control period.
         clock: Source of the time, for tests [s].
         allow_other_settings: Track with the task's own metric also where the system is another than
             that for which it was designed.
+        law: One of `lagros_policies.expert.LAWS`; None for the shipped one, or for "tuned" with a
+            metric.
 
     Raises:
         FileNotFoundError: The task's metric has not been made.
@@ -96,6 +99,7 @@ class TubeMpcPolicy(BasePolicy):
         deadline: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
         allow_other_settings: bool = False,
+        law: str | None = None,
     ) -> None:
         self.settings = task = task_of(settings)
         if replan_every is not None:
@@ -103,14 +107,19 @@ class TubeMpcPolicy(BasePolicy):
         deadline = task.control_period if deadline is None else deadline
         check_above("deadline", deadline, 0)
         if metric is None:
-            check_own_metric(task, allow_other_settings)
+            if law in WITHIN_METRIC:
+                check_own_metric(task, allow_other_settings)
         elif isinstance(metric, str | Path):
             metric = load_metric(metric, task.system.state_dim)
         elif not all(hasattr(metric, name) for name in ("contraction_rate", "condition_bound")):
             raise ValueError(f"metric={shown(metric)} must be a contraction metric, or its file")
         if not callable(clock):
             raise ValueError(f"clock={shown(clock)} must be a function that returns seconds")
-        self.expert = Expert(task, metric)
+        if law is not None:
+            self.name = "lqr-plan" if law == "lqr" else f"{self.name}:{law}"
+        elif metric is not None:
+            law = "tuned"
+        self.expert = Expert(task, metric, law=law)
         self.planner = self.expert.planner
         self.replan_every = replan_every
         self.deadline = deadline

@@ -136,7 +136,7 @@ def study(count: int, rates: tuple[float, ...] = _RATES) -> list[dict[str, Any]]
         except (InfeasibleError, RuntimeError) as error:
             rows.append({"alpha": rate, "law": "none", "problem": str(error)})
             continue
-        expert = CartPoleExpert(metric)
+        expert = CartPoleExpert(metric, law="tuned")
         flown = flown or episodes(expert, count)
         plans, pushes = flown
         least, largest = extreme_eigenvalues(metric)

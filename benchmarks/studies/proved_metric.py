@@ -40,7 +40,7 @@ _BOUND = 0.75
 
 def loop(metric: Metric, drawn: Episodes) -> dict[str, Any]:
     """Fly every episode under u* of a metric; return counts, and the mean effort [N^2 s]."""
-    law = tracking_law(CartPoleExpert(metric), drawn)
+    law = tracking_law(CartPoleExpert(metric, law="tuned"), drawn)
     every = np.arange(len(drawn.seeds))
     flown = fly(drawn, law, every, random_pushes(drawn, "uniform", _BOUND))
     error = np.linalg.norm(flown.states - drawn.plans, axis=-1)

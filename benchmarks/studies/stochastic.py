@@ -82,7 +82,7 @@ def spacecraft_row(rate: float, paths: int) -> dict[str, Any]:
 
 def cartpole_rows(intensity: tuple[float, ...], paths: int) -> list[dict[str, Any]]:
     """Fly plans under noise with least-norm u* and with the preferred feedback."""
-    expert = CartPoleExpert()
+    expert = CartPoleExpert(law="tuned")
     episodes = plan_episodes(expert, _PLANS, _NAMESPACE)
     plans = expert.track(episodes.states, episodes.controls)
     plan = np.arange(paths) % _PLANS

@@ -116,7 +116,7 @@ def tracking_law(
 
 def cartpole_study(count: int, parameters: Sequence[str]) -> list[dict[str, Any]]:
     """Fly every policy on every true system that has one of these parameters wrong."""
-    expert = CartPoleExpert()
+    expert = CartPoleExpert(law="tuned")
     settings = expert.task
     episodes = plan_episodes(expert, count, _NAMESPACE)
     policies = {"lagros": LagrosPolicy, "lqr": LqrPolicy, "ppo": PpoPolicy}

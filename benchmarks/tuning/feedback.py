@@ -276,7 +276,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, default=Path("benchmarks/results/feedback.json"))
     options = parser.parse_args()
     torch.set_num_threads(1)
-    expert = CartPoleExpert()
+    expert = CartPoleExpert(law="tuned")
     found = search(expert, options)
     seconds = time.process_time()
 

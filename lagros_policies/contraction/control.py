@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -170,21 +171,18 @@ class HeldControl:
         Returns:
             a (..., m, m), b (..., m) and c (...); with one control each of them (...).
         """
-        if self.system.control_dim == 1:
-            following, slope = hold_control_slope(self.system, state, nominal_control, self.period)
-            gain = slope[..., None]
-        else:
-            following, _, gain = linearise_hold(self.system, state, nominal_control, self.period)
-        planned = hold_step(self.system, nominal, nominal_control, self.period)
-        error = following - planned
-        matrix = self.metric.matrix(metric_place(self.metric, following, planned))
-        pull = np.einsum("...ij,...jk->...ik", matrix, gain)
-        a = np.einsum("...ij,...ik->...jk", gain, pull)
-        b = np.einsum("...i,...ij->...j", error, pull)
-        here = self.metric.matrix(metric_place(self.metric, state, nominal))
-        before = error_energy(here, state - nominal)
-        c = error_energy(matrix, error) - np.exp(-2.0 * self.rate * self.period) * before
-        return (a[..., 0, 0], b[..., 0], c) if self.system.control_dim == 1 else (a, b, c)
+
+        def ahead(following: FloatArray, planned: FloatArray) -> FloatArray:
+            return self.metric.matrix(metric_place(self.metric, following, planned))
+
+        return contracting_set(
+            self.system,
+            self.period,
+            self.rate,
+            (state, nominal, nominal_control),
+            self.metric.matrix(metric_place(self.metric, state, nominal)),
+            ahead,
+        )
 
     def interval(
         self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
@@ -207,9 +205,7 @@ class HeldControl:
                 f"{self.system!r} has {self.system.control_dim} controls: what contracts is an "
                 "ellipsoid, see quadratic()"
             )
-        a, b, c = self.quadratic(state, nominal, nominal_control)
-        root = np.sqrt(np.maximum(b * b - a * c, 0.0))
-        return (-b - root) / a, (-b + root) / a
+        return _ends(*self.quadratic(state, nominal, nominal_control))
 
     def __call__(
         self,
@@ -229,14 +225,69 @@ class HeldControl:
         Returns:
             u_d plus the contracting v nearest to the preferred one.
         """
-        control: FloatArray
-        if self.system.control_dim == 1:
-            low, high = self.interval(state, nominal, nominal_control)
-            control = nominal_control + np.clip(preferred, low, high)[..., None]
-        else:
-            ellipsoid = self.quadratic(state, nominal, nominal_control)
-            control = nominal_control + nearest_in_ellipsoid(*ellipsoid, np.asarray(preferred))
+        condition = self.quadratic(state, nominal, nominal_control)
+        control: FloatArray = nominal_control + nearest_contracting(*condition, preferred)
         return control
+
+
+def contracting_set(
+    system: System,
+    period: float,
+    rate: float,
+    place: tuple[FloatArray, FloatArray, FloatArray],
+    here: FloatArray,
+    ahead: Callable[[FloatArray, FloatArray], FloatArray],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a, b, c of v'a v + 2 b'v + c <= 0: the v = u - u_d that make V contract over a hold.
+
+    Args:
+        system: The system.
+        period: Control period h [s].
+        rate: alpha: V is to fall by exp(-2 alpha h) [1/s].
+        place: x (..., n), x_d (..., n) and u_d (..., m).
+        here: M of V at the instant, shape (..., n, n).
+        ahead: Gives M at the next instant from F(x, u_d) and F(x_d, u_d).
+
+    Returns:
+        a (..., m, m), b (..., m) and c (...); with one control each of them (...).
+    """
+    state, nominal, nominal_control = place
+    if system.control_dim == 1:
+        following, slope = hold_control_slope(system, state, nominal_control, period)
+        gain = slope[..., None]
+    else:
+        following, _, gain = linearise_hold(system, state, nominal_control, period)
+    planned = hold_step(system, nominal, nominal_control, period)
+    error, matrix = following - planned, ahead(following, planned)
+    pull = np.einsum("...ij,...jk->...ik", matrix, gain)
+    a = np.einsum("...ij,...ik->...jk", gain, pull)
+    b = np.einsum("...i,...ij->...j", error, pull)
+    before = error_energy(here, state - nominal)
+    c = error_energy(matrix, error) - np.exp(-2.0 * rate * period) * before
+    return (a[..., 0, 0], b[..., 0], c) if system.control_dim == 1 else (a, b, c)
+
+
+def nearest_contracting(
+    a: FloatArray, b: FloatArray, c: FloatArray, preferred: FloatArray | float
+) -> FloatArray:
+    """Return the point of a `contracting_set` that is nearest to a preferred one, shape (..., m).
+
+    Args:
+        a: As there.
+        b: As there.
+        c: As there.
+        preferred: v, shape (..., m); (...) of one control.
+    """
+    if np.ndim(a) == np.ndim(c):
+        low, high = _ends(a, b, c)
+        return np.clip(preferred, low, high)[..., None]
+    return nearest_in_ellipsoid(a, b, c, np.asarray(preferred))
+
+
+def _ends(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the ends of the interval of one control; where it is empty, its centre twice."""
+    root = np.sqrt(np.maximum(b * b - a * c, 0.0))
+    return (-b - root) / a, (-b + root) / a
 
 
 def nearest_in_ellipsoid(

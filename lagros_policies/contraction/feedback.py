@@ -16,6 +16,13 @@ _TERMINAL_WEIGHT = 10.0
 def riccati_gains(
     by_state: FloatArray, by_control: FloatArray, state: FloatArray, control: FloatArray
 ) -> FloatArray:
+    """Return the gains of `riccati_recursion` alone."""
+    return riccati_recursion(by_state, by_control, state, control)[0]
+
+
+def riccati_recursion(
+    by_state: FloatArray, by_control: FloatArray, state: FloatArray, control: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Solve the backward Riccati recursion of a time-varying regulator.
 
     Args:
@@ -25,13 +32,15 @@ def riccati_gains(
         control: Diagonals of R_k, shape (..., N, m).
 
     Returns:
-        K_k of v = -K_k e, shape (..., N, m, n).
+        K_k of v = -K_k e, shape (..., N, m, n), and P_k, whose e'P_k e is what is left to pay from
+        step k on, shape (..., N + 1, n, n).
     """
     steps, n, m = by_control.shape[-3:]
     batch = np.broadcast_shapes(by_state.shape[:-3], state.shape[:-2])
-    gains = np.empty((*batch, steps, m, n))
+    gains, values = np.empty((*batch, steps, m, n)), np.empty((*batch, steps + 1, n, n))
     eye = np.eye(n)
-    value = np.broadcast_to(_TERMINAL_WEIGHT * state[..., -1, :, None] * eye, (*batch, n, n))
+    values[..., steps, :, :] = _TERMINAL_WEIGHT * state[..., -1, :, None] * eye
+    value = values[..., steps, :, :]
     for step in range(steps - 1, -1, -1):
         slope, push = by_state[..., step, :, :], by_control[..., step, :, :]
         ahead = value @ slope
@@ -42,5 +51,5 @@ def riccati_gains(
         gain = pull / stiffness if m == 1 else np.linalg.solve(stiffness, pull)
         value = state[..., step, :, None] * eye + np.swapaxes(slope, -1, -2) @ ahead
         value = value - np.swapaxes(pull, -1, -2) @ gain
-        gains[..., step, :, :] = gain
-    return gains
+        gains[..., step, :, :], values[..., step, :, :] = gain, value
+    return gains, values

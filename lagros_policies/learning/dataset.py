@@ -380,11 +380,13 @@ def record_of(
     metric: Metric, settings: ExpertDataSettings, task: Task, network: Mlp | None
 ) -> dict[str, Any]:
     """Return all that the data depend on."""
+    expert = Expert(task, metric)
     law = {
         "coefficients": hashlib.sha256(metric.coefficients.tobytes()).hexdigest(),
         "alpha": metric.contraction_rate,
         "region": region_record(metric.region),
-        "feedback": asdict(Expert(task, metric).feedback),
+        "law": expert.law_name,
+        "feedback": asdict(expert.feedback),
     }
     if metric.basis is not None:
         law |= {"basis": list(metric.basis.terms), "point": metric.point}

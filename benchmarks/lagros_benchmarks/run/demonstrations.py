@@ -257,5 +257,6 @@ class SingleExpert(Expert):
                 "verification": None if check is None else asdict(check),
             },
             "planner": asdict(expert.planner.settings),
+            "law": expert.law_name,
             "feedback": asdict(expert.feedback),
         }

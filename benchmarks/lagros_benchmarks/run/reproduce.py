@@ -153,7 +153,7 @@ class ReproduceSettings:
             }
             made = {
                 "metric": metric,
-                "policy_settings": {**weights, "tube-mpc": {"metric": metric}},
+                "policy_settings": weights,
             }
         return BenchmarkSettings.for_task(
             self.task,

@@ -86,7 +86,7 @@ def check_policy(name: str, task: str | None = None) -> None:
         if is_file(model.path):
             return
         raise ValueError(f"there is no file {str(model.path)!r} for a policy")
-    own = user_class(name)
+    own = None if name.partition(":")[0] in names else user_class(name)
     if own is not None:
         if is_importable(own.module):
             return

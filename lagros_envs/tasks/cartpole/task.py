@@ -19,7 +19,7 @@ from lagros_envs.checks import (
     check_positive,
 )
 from lagros_envs.draw import Renderer
-from lagros_envs.task import LARGEST_CONTROL, Layout, Learning, Scenario, Task
+from lagros_envs.task import LARGEST_CONTROL, Feedback, Layout, Learning, Scenario, Task
 from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tube import PaperTube
 from lagros_envs.values import use_plain_numbers
@@ -73,6 +73,15 @@ class CartPoleSettings(Task):
     state_names = ("p [m]", "theta [rad]", "dp/dt [m/s]", "dtheta/dt [rad/s]")
     control_names = ("force [N]",)
     rates = (2, 3)
+    # Chosen by the trade-off of benchmarks/studies/plan_law.py.
+    feedback = Feedback(
+        state_weights=(1.0, 1.25, 0.6, 1.1),
+        control_weights=(0.01,),
+        rate=0.3,
+        early_state=(-2.9, -1.1, 1.2, -2.9),
+        early_control=(5.0,),
+        settling=1.6,
+    )
     learning = Learning()
     short_goal = (0,)
 

@@ -16,7 +16,8 @@ class CartPoleExpert(Expert):
     Args:
         metric: The contraction metric; the shipped one if left out.
         task: The task.
-        feedback: What u* prefers where contraction leaves a choice.
+        feedback: What the law "tuned" prefers where contraction leaves a choice.
+        law: As of `Expert`.
     """
 
     task: CartPoleSettings
@@ -26,6 +27,8 @@ class CartPoleExpert(Expert):
         metric: ContractionMetric | None = None,
         task: CartPoleSettings | None = None,
         feedback: FeedbackSettings | None = None,
+        law: str | None = None,
     ) -> None:
         task = task or CartPoleSettings()
-        super().__init__(task, metric, GatedRegulator(task, feedback))
+        preference = None if feedback is None else GatedRegulator(task, feedback)
+        super().__init__(task, metric, preference, law)

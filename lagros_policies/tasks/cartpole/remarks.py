@@ -145,7 +145,8 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
         metric: ContractionMetric | str | Path | None = None,
         **planning: Any,
     ) -> None:
-        super().__init__(settings, metric, **planning)
+        super().__init__(settings, metric, law="tuned", **planning)
+        self.name = type(self).name
         law = self.expert.law
         # A function of the module, so that the policy can be pickled.
         regressor = partial(_friction_and_mass, law.system)
