@@ -299,7 +299,8 @@ class Expert:
     ) -> FloatArray:
         """Return u_d plus the nearest v to a deviation that contracts in the plan's metric."""
         task, weights, matrices = self.task, self._weights, plans.matrices
-        assert weights is not None and matrices is not None
+        assert weights is not None
+        assert matrices is not None
         place = state, plans.states[plan, index], plans.controls[plan, index]
         here, ahead = matrices[plan, index], matrices[plan, index + 1]
         if len(state) == 1:

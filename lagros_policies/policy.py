@@ -30,6 +30,7 @@ _OPTIONAL = ("name", "observes", "reseed", "counters", "bare_forward", "example_
 _SINGLE = {
     "learned": "lagros_policies.learned:LearnedPolicy",
     "tube-mpc": "lagros_policies.tube_mpc:TubeMpcPolicy",
+    "tube-mpc:replan": "lagros_policies.tube_mpc:ReplanningTubeMpcPolicy",
     "lagros": "lagros_policies.lagros:LagrosPolicy",
     "lqr": "lagros_policies.baselines:LqrPolicy",
     "random": "lagros_policies.baselines:RandomPolicy",

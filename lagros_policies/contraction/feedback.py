@@ -51,5 +51,7 @@ def riccati_recursion(
         gain = pull / stiffness if m == 1 else np.linalg.solve(stiffness, pull)
         value = state[..., step, :, None] * eye + np.swapaxes(slope, -1, -2) @ ahead
         value = value - np.swapaxes(pull, -1, -2) @ gain
+        # What rounding leaves of asymmetry would grow with an unstable system.
+        value = 0.5 * (value + np.swapaxes(value, -1, -2))
         gains[..., step, :, :], values[..., step, :, :] = gain, value
     return gains, values

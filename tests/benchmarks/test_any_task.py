@@ -154,7 +154,7 @@ def test_a_task_of_a_module_is_found_in_the_folder_of_the_command(slide):
         (("--agents", "3"), "--agents: agents=(3,) does not fit: slide is one body"),
         (("--safety-filter", "all"), "does not fit: slide is one body; leave it out"),
         (("--scene", "s.png"), "--scene: slide has no worlds of agents to draw"),
-        (("--policies", "tube-mpc"), "slide_metric.json"),
+        (("--policies", "tube-mpc:tuned"), "slide_metric.json"),
         (("--policies", "centralized"), "unknown policy 'centralized'"),
         (("--policies", "lqr", "--replan-every", "2"), "none of --policies"),
     ],

@@ -80,7 +80,7 @@ def test_the_adaptive_policy_learns_what_tube_mpc_cannot_stand(
     model: Any, changed: dict[str, float], seed: int
 ) -> None:
     adaptive = lagros_policies.make(ADAPTIVE, model, deadline=1e9)
-    without = lagros_policies.make("tube-mpc", model, deadline=1e9)
+    without = lagros_policies.make("tube-mpc:tuned", model, deadline=1e9)
     done, memory, errors = fly(adaptive, seed, **changed)
     lost, _, others = fly(without, seed, **changed)
     assert done

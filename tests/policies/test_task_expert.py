@@ -215,6 +215,6 @@ def test_a_task_without_a_metric_is_refused_with_a_remedy(tmp_path):
         metric_of(Drive())
     elsewhere = type("Elsewhere", (Slide,), {"weights": tmp_path})()
     with pytest.raises(FileNotFoundError, match=r"slide has no slide_metric.json in .*reproduce"):
-        Expert(elsewhere)
+        Expert(elsewhere, law="tuned")
     with pytest.raises(FileNotFoundError, match=r"slide; `lagros reproduce tests.*Slide` makes it"):
-        Expert(Slide())
+        Expert(Slide(), law="least-norm")

@@ -215,7 +215,8 @@ def test_the_shipped_metric_tracks_no_other_cart_pole():
     longer = CartPoleSettings(system=dataclasses.replace(CartPole(), half_length=1.0))
     env = CartPoleEnv(settings=longer)
     for name in (
-        "tube-mpc",
+        "tube-mpc:least-norm",
+        "tube-mpc:tuned",
         "lagros_policies.tasks.cartpole.remarks:AdaptiveTubeMpcPolicy",
         "lagros_policies.tasks.cartpole.remarks:NeuralTubeMpcPolicy",
     ):
@@ -224,7 +225,9 @@ def test_the_shipped_metric_tracks_no_other_cart_pole():
         assert make(name, env, allow_other_settings=True)
     # Who names a metric says that it is for this cart-pole.
     assert make("tube-mpc", env, metric=shipped_metric()).name == "tube-mpc"
-    assert make("tube-mpc", CartPoleEnv(settings=CartPoleSettings(time_limit=18.0)))
+    assert make("tube-mpc:tuned", CartPoleEnv(settings=CartPoleSettings(time_limit=18.0)))
+    # The metric along a plan is made for whatever system is planned for.
+    assert make("tube-mpc", env)
 
 
 def test_every_policy_takes_the_permission():
