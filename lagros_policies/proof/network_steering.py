@@ -121,7 +121,10 @@ class NetworkSteering:
         # What is seen is rounded to single precision.
         reach, centre = errors.radius, state + errors.centre
         unseen = above(SINGLE * (np.abs(centre) + reach) + DOUBLE * np.abs(centre))
-        found = self._enclosed(step, centre, above(reach + unseen))
+        if self._law is None:
+            found = self._curved(step, centre, above(reach + unseen), *_axes(errors, unseen))
+        else:
+            found = self._enclosed(step, centre, above(reach + unseen))
         offset = found.offset - control
         largest = np.abs(found.range()).upper + np.abs(np.array(self.task.control_centre))
         size = np.abs(found.gain)
@@ -129,16 +132,66 @@ class NetworkSteering:
         radius = radius + DOUBLE * (np.abs(offset) + np.abs(control))
         return Steering(found.gain, offset, above(radius))
 
-    def _enclosed(self, step: int, centre: FloatArray, reach: FloatArray) -> AffineEnclosure:
-        """Enclose the control in units of u over boxes of the state, single precision included."""
+    def _curved(
+        self,
+        step: int,
+        centre: FloatArray,
+        reach: FloatArray,
+        axes: FloatArray,
+        back: FloatArray,
+        along: FloatArray,
+    ) -> AffineEnclosure:
+        """Enclose a curved network over boxes |R e| <= along that lie along the errors.
+
+        Args:
+            step: Index of the control step.
+            centre: Middle of each box, shape (p, n).
+            reach: Bounds of |e| by coordinate, shape (p, n).
+            axes: T, almost the inverse of R, shape (p, n, n).
+            back: R, shape (p, n, n).
+            along: Half the sides along the axes, shape (p, n).
+        """
         slope = self._slope[:, step]
-        count = slope.shape[1]
+        sizes = np.abs(slope)
+        # e = T f + what R misses of the inverse of T, which the features do not see.
+        missed = DOUBLE * (np.abs(axes) @ (np.abs(back) @ reach[..., None]))
+        turned = slope @ axes
+        unturned = DOUBLE * (sizes @ (np.abs(axes) @ along[..., None]))
+        lost = above((sizes @ missed + unturned)[..., 0])
+        found = self._enclosed(step, centre, along, turned, lost)
+        gain = found.gain @ back
+        turn = np.einsum("pmi,pij,pj->pm", np.abs(found.gain), np.abs(back), reach)
+        return AffineEnclosure(
+            centre, reach, found.offset, gain, above(found.error + DOUBLE * turn)
+        )
+
+    def _enclosed(
+        self,
+        step: int,
+        centre: FloatArray,
+        reach: FloatArray,
+        slope: FloatArray | None = None,
+        lost: FloatArray | float = 0.0,
+    ) -> AffineEnclosure:
+        """Enclose the control in units of u over boxes of the state, single precision included.
+
+        Args:
+            step: Index of the control step.
+            centre: Middle of each box, shape (p, n).
+            reach: Half its sides, shape (p, n).
+            slope: Of the affine features along the sides, shape (p, k, n); by the state if left
+                out.
+            lost: What the features may be off that, shape (p, k).
+        """
+        by_state = self._slope[:, step]
+        count = by_state.shape[1]
         moved = exact(centre) - self._place[:, step]
-        near = product(exact(slope), moved[:, None])
+        near = product(exact(by_state), moved[:, None])
         value = exact(self._features[:, step, :count]) + near
+        slope = by_state if slope is None else slope
         away = np.einsum("pfn,pn->pf", np.abs(slope), reach)
         values = value + symmetric(above(away))
-        rounding = above(SINGLE * np.abs(values).upper)
+        rounding = above(SINGLE * np.abs(values).upper + lost)
         if self._law is not None:
             found = self._scheduled(step, centre, reach, value, values, rounding)
         else:
@@ -179,6 +232,23 @@ class NetworkSteering:
         # The product of gain and slope is rounded, too.
         error = error + DOUBLE * np.einsum("pmk,pkn,pn->pm", np.abs(middle), np.abs(slope), reach)
         return AffineEnclosure(centre, reach, total.midpoint, by_state, above(error))
+
+
+def _axes(errors: ErrorSet, unseen: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return axes along which a set of errors lies, and how far it goes along them.
+
+    Returns:
+        T of e = T f, shape (p, n, n), R of f = R e, likewise, its inverse but for rounding, and
+        bounds of |f|, shape (p, n), with |e| up to `unseen` (p, n) more.
+    """
+    columns = errors.generators
+    scale = np.sqrt((columns**2).sum(axis=-1))
+    scale = np.maximum(np.where(scale > 0.0, scale, 1.0), 1e-100)
+    unit = columns / scale[..., None]
+    _, vectors = np.linalg.eigh(unit @ np.swapaxes(unit, 1, 2))
+    back = np.swapaxes(vectors, 1, 2) / scale[:, None, :]
+    along = errors.support(back) + np.einsum("pij,pj->pi", np.abs(back), unseen)
+    return scale[..., None] * vectors, back, above(along)
 
 
 def _inputs(
