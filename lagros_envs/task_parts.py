@@ -117,8 +117,9 @@ class Defaults:
         safety_filter: "none", "all" policies use it, or "both" one after the other.
         attack_episodes: Episodes that `lagros attack` searches.
         attack_budget: Flights that it may spend on each.
-        certify_policies: What `lagros certify` may be asked about, the first by default.
-        certify_episodes: Flights behind a calibrated bound.
+        certify_policies: What `lagros certify` is about, the first by default; of many agents it
+            may be asked about no other.
+        certify_episodes: Episodes that it guarantees and flies.
         speed: Of the film of `lagros watch`, as a multiple of the real one.
     """
 
@@ -131,6 +132,6 @@ class Defaults:
     safety_filter: str = "none"
     attack_episodes: int = 10
     attack_budget: int = 1000
-    certify_policies: tuple[str, ...] = ("lagros", "tube-mpc")
-    certify_episodes: int = 400
+    certify_policies: tuple[str, ...] = ("tube-mpc", "lagros")
+    certify_episodes: int = 50
     speed: float = 1.0

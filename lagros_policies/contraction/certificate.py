@@ -1,4 +1,4 @@
-"""One certificate of a task: what is claimed of its metric and tubes, and how each claim is known.
+"""One certificate of a task: what is claimed of flights or of a metric, and how each is known.
 
 Pure functions: they prove and compute, and read no file and fly no episode. What was calibrated or
 observed is added by whoever flew (`Certificate.with_evidence`).
@@ -23,7 +23,8 @@ class TubeSizes:
     Attributes:
         paper: The published tube: a success threshold, not a bound of this package; None where none
             is published.
-        certified: Theorem 1 with the certificate's own numbers; None where it gives no tube.
+        certified: What is proved: of flights by their own tubes, of a metric by Theorem 1 with the
+            certificate's numbers; None where there is no tube.
         observed: The largest ||x - x_d|| of the episodes flown; None without any.
     """
 
@@ -34,17 +35,18 @@ class TubeSizes:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What is claimed of a metric on a region.
+    """What is claimed of flights, or of a metric on a region.
 
     Attributes:
         task: Name of the task.
-        policy: Whose learning error it counts with.
-        region: Names to [low, high], where the condition holds.
+        policy: Who flies, or whose control the theorems speak of.
+        region: Names to [low, high], where the condition holds; empty, and the next four and the
+            coefficients None, where the claims are of flights.
         alpha: Contraction rate [1/s].
         chi: I <= W_bar <= chi I on the region, in the units of the state.
         nu: Weight of B B' in the condition.
         b_bar: Bound of ||B(x)|| on the region.
-        epsilon_l: Learning error ||u_L - u*||, in units of the control.
+        epsilon_l: Learning error ||u_L - u*||, in units of the control; None of another policy.
         d_bar: Bound of the disturbance, in units of the state per second.
         channels: "all", or "rates" where the certified tube is for disturbances of the rates alone.
         basis: How W_bar depends on the state.
@@ -65,15 +67,15 @@ class Certificate:
     task: str
     policy: str
     region: Mapping[str, tuple[float, float]]
-    alpha: float
-    chi: float
-    nu: float
-    b_bar: float
-    epsilon_l: float
+    alpha: float | None
+    chi: float | None
+    nu: float | None
+    b_bar: float | None
+    epsilon_l: float | None
     d_bar: float
     channels: str
     basis: str
-    coefficients: FloatArray
+    coefficients: FloatArray | None
     tube: TubeSizes
     statements: tuple[Statement, ...]
     details: Mapping[str, Any] = field(default_factory=dict)
@@ -84,6 +86,12 @@ class Certificate:
     everywhere: bool = False
     headline: str = ""
     guarantee: Mapping[str, Any] | None = None
+
+    @classmethod
+    def of_flights(cls, **claims: Any) -> Certificate:
+        """Return a certificate that is of flights and of no metric."""
+        nothing: dict[str, Any] = dict.fromkeys(("alpha", "chi", "nu", "b_bar", "coefficients"))
+        return cls(**nothing, region={}, channels="all", basis="", **claims)
 
     @property
     def reached(self) -> float | None:
@@ -120,7 +128,9 @@ class Certificate:
             "d_bar": self.d_bar,
             "channels": self.channels,
             "region": {name: list(ends) for name, ends in self.region.items()},
-            "metric": {"basis": self.basis, "coefficients": self.coefficients.tolist()},
+            "metric": None
+            if self.coefficients is None
+            else {"basis": self.basis, "coefficients": self.coefficients.tolist()},
             "tube": {
                 "paper": self.tube.paper,
                 "certified": _finite(self.tube.certified),

@@ -36,7 +36,6 @@ class Tubes(Protocol):
 
     Attributes:
         closed: Whether there is a tube around the whole plan, shape (p,).
-        directions: l, shape (q, n); the first n are the coordinates.
         outputs: Bounds of |l'e| at the control instants, shape (p, N + 1, q).
         between: The same over each whole hold, shape (p, N, q).
         norm: Bounds of ||e|| at the control instants, shape (p, N + 1).
@@ -44,7 +43,6 @@ class Tubes(Protocol):
     """
 
     closed: BoolArray
-    directions: FloatArray
     outputs: FloatArray
     between: FloatArray
     norm: FloatArray
@@ -60,7 +58,8 @@ class Guarantees:
         reaches: Whether the goal is within the radius of success at the time limit, shape (p,).
         upright: Whether no state of the tube has fallen (`Task.fallen`), shape (p,).
         clear: Whether no straight way of a step touches a disc, shape (p,).
-        within: Whether u keeps the bounds of the control, shape (p,).
+        within: Whether the law never asks for more than the bounds of the control, shape (p,);
+            what they take of it is in the tube, so that nothing else depends on it.
         goal_distance: Bound of the distance from the goal at the time limit, shape (p,).
         state: Bounds of |x| by coordinate, at the instants and between them, shape (p, n).
         error: Bounds of |x - x_d|, likewise.
@@ -82,7 +81,7 @@ class Guarantees:
     @cached_property
     def holds(self) -> BoolArray:
         """Whether an episode is guaranteed: a tube, and everything that is asked, shape (p,)."""
-        return self.closed & self.reaches & self.upright & self.clear & self.within
+        return self.closed & self.reaches & self.upright & self.clear
 
 
 def guarantees(
@@ -92,6 +91,7 @@ def guarantees(
     states: FloatArray,
     controls: FloatArray,
     tubes: Tubes,
+    directions: FloatArray | None = None,
 ) -> Guarantees:
     """Return what tubes around plans guarantee of their episodes.
 
@@ -102,8 +102,11 @@ def guarantees(
         states: x_d at the control instants, shape (p, N + 1, n).
         controls: u_d, shape (p, N, m).
         tubes: The tubes.
+        directions: l of their outputs, shape (q, n), the first n of which are the coordinates; None
+            for these alone.
     """
     n = task.system.state_dim
+    rays = np.eye(n) if directions is None else directions
     closed = np.asarray(tubes.closed, bool)
     # A number in place of what is not known: intervals have no sine of infinity.
     reach = np.where(closed[:, None, None], tubes.outputs[..., :n], 0.0)
@@ -118,7 +121,7 @@ def guarantees(
         closed=closed,
         reaches=distance <= radius,
         upright=closed & _never(task, at),
-        clear=closed & _clear(task, discs, states, tubes),
+        clear=closed & _clear(task, discs, states, tubes, rays),
         within=closed & _within(task, controls, deviation),
         goal_distance=distance,
         state=largest.max(axis=1) * (1.0 + _ROUNDING),
@@ -256,7 +259,9 @@ def _within(task: Task, controls: FloatArray, deviation: FloatArray) -> BoolArra
     return np.asarray(np.all(kept | (np.isinf(low) & np.isinf(high)), axis=(1, 2)))
 
 
-def _clear(task: Task, discs: FloatArray, states: FloatArray, tubes: Tubes) -> BoolArray:
+def _clear(
+    task: Task, discs: FloatArray, states: FloatArray, tubes: Tubes, directions: FloatArray
+) -> BoolArray:
     """Return which plans keep every straight way of a step in their tube off the discs, (p,).
 
     A line between disc and way parts the two: the way lies beyond it if both of its ends do, for
@@ -278,26 +283,28 @@ def _clear(task: Task, discs: FloatArray, states: FloatArray, tubes: Tubes) -> B
     for turn in _TURNS:
         cosine, sine = math.cos(turn), math.sin(turn)
         ray = nearest @ np.array([[cosine, sine], [-sine, cosine]])
-        reach = _reach(task, tubes, ray)
+        reach = _reach(task, tubes, directions, ray)
         first = np.einsum("...c,...c->...", begin - centre, ray) - reach[0]
         last = np.einsum("...c,...c->...", end - centre, ray) - reach[1]
         apart |= np.minimum(first, last) >= contact * (1.0 + _ROUNDING) + _ROUNDING
     return np.asarray(apart.all(axis=(1, 2)))
 
 
-def _reach(task: Task, tubes: Tubes, ray: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _reach(
+    task: Task, tubes: Tubes, directions: FloatArray, ray: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Bound ray'e of the position at both ends of each step, for rays (p, N, k, 2) of length one.
 
     A ray is a sum of any two directions of the tube in the plane: its bound that of theirs.
     """
     place = list(task.position)
-    others = np.delete(tubes.directions, place, axis=1)
-    flat = np.flatnonzero(~others.any(axis=1) & tubes.directions.any(axis=1))
+    others = np.delete(directions, place, axis=1)
+    flat = np.flatnonzero(~others.any(axis=1) & directions.any(axis=1))
     ends = tubes.outputs[:, :-1], tubes.outputs[:, 1:]
     norms = tubes.norm[:, :-1, None], tubes.norm[:, 1:, None]
     found = [np.broadcast_to(norm, ray.shape[:-1]) for norm in norms]
     for pair in combinations(flat, 2):
-        basis = tubes.directions[list(pair)][:, place].T
+        basis = directions[list(pair)][:, place].T
         if abs(np.linalg.det(basis)) < 1e-6 * np.linalg.norm(basis) ** 2:
             continue
         weights = np.abs(ray @ np.linalg.inv(basis).T)

@@ -140,7 +140,7 @@ def test_what_a_task_of_one_body_lacks_is_said(invoke: Any) -> None:
         (("watch", FILE, "--agents", 2), "--agents is for worlds of many agents"),
         (("attack", FILE, "--safety-filter"), "for worlds of many agents"),
         (("train", FILE, "--parallel-env"), "--parallel-env is for many agents"),
-        (("certify", FILE), "slider has no metric of its own"),
+        (("certify", FILE, "--episodes", 0), "slider has no contraction metric"),
         (("data", "export", "--minari", "--task", FILE), "slider has no contraction metric"),
     ):
         result = invoke(*options)
@@ -188,25 +188,33 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Slide:
     return Measured()
 
 
-def test_a_certificate_says_what_is_observed_calibrated_and_not_proved(
-    measured: Slide, invoke: Any
-) -> None:
+def test_a_certificate_of_flights_says_what_each_claim_is(measured: Slide, invoke: Any) -> None:
     result = invoke(
-        *("certify", "measured", "--policy", "tube-mpc", "--bound", 0.05, "--episodes", 20),
+        *("certify", "measured", "--policy", "tube-mpc", "--bound", 0.05, "--episodes", 19),
         *("--json", "c.json"),
     )
     assert result.exit_code == 0, result.output
-    words = " ".join(result.stdout.split())
-    assert "no tube is certified" in words
-    assert "no tube is certified for measured" in words
+    found = json.loads(Path("c.json").read_text())
+    kinds = {line["kind"] for line in found["statements"]}
+    assert {"observed", "calibrated"} <= kinds
+    assert found["tube"]["observed"] > 0.0
+    # No metric flies, and Theorem 1 is about none of it.
+    assert found["alpha"] is found["chi"] is found["metric"] is None
+    assert any("Theorem 1" in line for line in found["not_proved"])
+
+
+def test_a_certificate_of_a_metric_says_what_is_proved_of_it(measured: Slide, invoke: Any) -> None:
+    result = invoke("certify", "measured", "--episodes", 0, "--json", "c.json")
+    assert result.exit_code == 0, result.output
+    assert "no tube is certified" in " ".join(result.stdout.split())
     found = json.loads(Path("c.json").read_text())
     kinds = [line["kind"] for line in found["statements"]]
     # The system is linear and the metric constant: the proof is one inequality.
     assert kinds.count("proved") == 2
-    assert set(kinds) == {"proved", "observed", "calibrated"}
+    assert set(kinds) == {"proved", "observed"}
     assert len(found["not_proved"]) == 1
-    assert found["tube"]["certified"] is None
-    assert found["tube"]["observed"] > 0.0
+    assert found["guarantee"] is found["tube"]["certified"] is found["tube"]["observed"] is None
+    assert found["policy"] == "u*"
     assert found["region"]["vx"] == [-9.0, 9.0]
     # I <= W_bar <= chi I.
     spectrum = np.linalg.eigvalsh(np.array(found["metric"]["coefficients"])[0])
@@ -222,8 +230,7 @@ def test_a_metric_that_does_not_contract_makes_no_certificate(measured: Slide, i
     fast = verify_metric(measured.system, replace(metric, contraction_rate=9.0), samples, 2)
     # What its file says of its check is not taken over: that may be of another system.
     save_metric(replace(fast, verification=metric.verification), "fast.json")
-    arguments = ("certify", "measured", "--policy", "tube-mpc", "--episodes", 0)
-    result = invoke(*arguments, "--metric", "fast.json")
+    result = invoke("certify", "measured", "--metric", "fast.json")
     assert result.exit_code == 1
     assert result.output.splitlines()[1].startswith("NOT every claim holds")
 

@@ -263,7 +263,7 @@ def invoke(tmp_path, monkeypatch):
         "run.reproduction.reproduce",
         "report.playback.Playback.play",
         "tasks.cartpole.certify.cartpole_proofs",
-        "tasks.cartpole.certify.fly_kinds",
+        "evidence.single.evidence_of",
         "tasks.spacecraft.certify.fly_spacecraft",
         "commands.train._train_one",
         "worst_case.attack.run_attack",

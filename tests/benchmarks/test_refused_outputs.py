@@ -20,7 +20,7 @@ WORK = (
     "lagros_benchmarks.run.runner.run_benchmark",
     "lagros_benchmarks.run.reproduction.reproduce",
     "lagros_benchmarks.worst_case.attack.run_attack",
-    "lagros_benchmarks.tasks.cartpole.certify.certify",
+    "lagros_benchmarks.evidence.single.certify",
     "lagros_benchmarks.tasks.spacecraft.certify.certify",
     "lagros_benchmarks.commands.train._train_one",
     "lagros_benchmarks.commands.export._written",

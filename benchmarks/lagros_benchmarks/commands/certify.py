@@ -1,4 +1,4 @@
-"""`lagros certify`: what is proved, calibrated and observed of a task, in one certificate."""
+"""`lagros certify`: for how many episodes what is guaranteed, and what that rests on."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, get_args
 import typer
 
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs
-from lagros_benchmarks.commands.terminal import fail, file_option
+from lagros_benchmarks.commands.terminal import fail, file_option, find_users_modules
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from lagros_envs.task import Described
     from lagros_policies.contraction.certificate import Certificate
 
 _MOST_EPISODES = 1_000_000
@@ -23,18 +24,24 @@ _CHANNELS = {"all": "all states disturbed", "rates": "the rates disturbed, not t
 
 def certify(
     task: Annotated[str, typer.Argument(help="As for `lagros bench`.")],
-    metric: Annotated[Path | None, file_option("A metric of your own; ours if not.")] = None,
+    metric: Annotated[
+        Path | None, file_option("Certify this contraction metric in place of flights.")
+    ] = None,
     policy: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", help="lagros, or u* itself: tube-mpc of one body, centralized of many."
+            metavar="NAME",
+            help="Who flies, as for `lagros bench`; of many agents lagros or centralized.",
         ),
     ] = None,
     json: Annotated[Path | None, file_option("Write the certificate.")] = None,
     bound: Annotated[float | None, typer.Option(help="d̄; the task's own if not given.")] = None,
     episodes: Annotated[
         int | None,
-        typer.Option(help="Episodes (worlds) flown; the task's own if not given, 0 for none."),
+        typer.Option(
+            help="Episodes (worlds) that are to be guaranteed and flown; the task's own if not "
+            "given, 0 for the task's metric in their place."
+        ),
     ] = None,
     seconds: Annotated[float, typer.Option(help="Time for each search for a proof, in s.")] = 60.0,
     largest: Annotated[
@@ -42,25 +49,23 @@ def certify(
         typer.Option("--largest", help="Claim the largest multiple of the region that is proved."),
     ] = False,
 ) -> None:
-    """Print one certificate: region, α, χ, tube, and which kind each claim is.
+    """Print for how many episodes what is guaranteed, and which kind each claim behind it is.
 
     Ends with status 1 if anything that it claims does not hold.
     """
     from lagros_benchmarks.evidence.single import Question, UnservedError
+    from lagros_benchmarks.run.library import SetupError
     from lagros_benchmarks.run.room import room_of
-    from lagros_envs.checks import check_disturbance_bound, check_positive, check_whole, shown
+    from lagros_envs.checks import check_disturbance_bound, check_positive, check_whole
     from lagros_envs.reading import check_file
     from lagros_envs.registry import find_task
 
+    find_users_modules([task, *([policy] if policy else [])])
     try:
         described = find_task(task)
         defaults = described.defaults
         asked = defaults.certify_policies[0] if policy is None else policy
-        if asked not in defaults.certify_policies:
-            raise ValueError(
-                f"--policy: {shown(asked)} must be one of {', '.join(defaults.certify_policies)}: "
-                "the theorems speak of u* and of what imitates it"
-            )
+        check_asked(described, asked)
         question = Question(
             policy=asked,
             bound=defaults.bound if bound is None else bound,
@@ -74,15 +79,24 @@ def certify(
         check_whole("episodes", question.episodes, 0, _MOST_EPISODES)
         check_positive("seconds", seconds)
         check_outputs({"--json": json}, {"--metric": metric})
+        asks = metric is not None or largest or question.episodes == 0
+        # The certificate of many agents takes all of it.
+        of_metric = asks and described.most_agents == 1
+        if of_metric and (policy or episodes):
+            raise ValueError(
+                "--metric, --largest and --episodes 0 are about a metric, which nobody flies: "
+                "leave out --policy and --episodes"
+            )
     except ValueError as error:
         fail(error)
     try:
         if metric is not None:
             check_file(metric)
-        found = room_of(described).part("certify")(described, question)
+        part = "certify_metric" if of_metric else "certify"
+        found = room_of(described).part(part)(described, question)
     except UnservedError as error:
         fail(error)
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError, ImportError, SetupError) as error:
         # A metric that cannot be read, or is none, is a certificate that cannot be given.
         fail(error, status=1)
     delivery = Delivery()
@@ -95,6 +109,25 @@ def certify(
         raise typer.Exit(1)
 
 
+def check_asked(task: Described, policy: str) -> None:
+    """Check that a certificate can be asked for a policy.
+
+    Raises:
+        ValueError: It is none of the task; of many agents, of which nothing is said either.
+    """
+    from lagros_benchmarks.run.settings import check_policy
+    from lagros_envs.checks import shown
+
+    names = task.defaults.certify_policies
+    if task.most_agents == 1:
+        check_policy(policy, task.name)
+    elif policy not in names:
+        raise ValueError(
+            f"--policy: {shown(policy)} must be one of {', '.join(names)}: no statement of ours is "
+            "about another"
+        )
+
+
 def print_certificate(found: Certificate) -> None:
     """Print a certificate, 80 columns wide: what it comes to, its figures, every claim."""
     from rich.console import Console
@@ -102,10 +135,10 @@ def print_certificate(found: Certificate) -> None:
 
     console = Console(width=_WIDTH, highlight=False)
     if found.headline:
-        console.print(Text(found.headline, style="bold"))
+        console.print(Text(found.headline, style="bold"), soft_wrap=True)
         console.print()
     console.print(Text(f"Certificate of {found.task}, policy {found.policy}, d̄ = {found.d_bar:g}"))
-    console.print(Text(verdict(found), style="bold"))
+    console.print(Text(verdict(found), style="" if found.headline else "bold"))
     console.print()
     console.print(_numbers(found))
     console.print()
@@ -149,24 +182,31 @@ def _numbers(found: Certificate) -> Table:
     )
     if found.everywhere:
         region = f"all states; to draw from: {region}"
-    tube, terms = found.tube, len(found.coefficients)
-    rows = {
-        "region": region,
-        "α [1/s]": f"{found.alpha:.6g}",
-        "χ": at_most(found.chi, 6),
-        "ν": at_most(found.nu, 6),
-        "b̄": at_most(found.b_bar, 6),
-        "ε_ℓ": f"{found.epsilon_l:.6g} (observed)",
-        "d̄": f"{found.d_bar:g}",
+    tube = found.tube
+    rows = {"d̄": f"{found.d_bar:g}"}
+    if found.epsilon_l is not None:
+        rows = {"ε_ℓ": f"{found.epsilon_l:.6g} (observed)", **rows}
+    if found.coefficients is not None:
+        numbers = {"χ": found.chi, "ν": found.nu, "b̄": found.b_bar}
+        rows = {
+            "region": region,
+            "α [1/s]": f"{found.alpha:.6g}",
+            **{name: at_most(value, 6) for name, value in numbers.items() if value is not None},
+            **rows,
+        }
+    limits = _CHANNELS[found.channels] if found.coefficients is not None else "guaranteed flights"
+    rows |= {
         "tube, paper": "none is published"
         if tube.paper is None
         else f"{tube.paper:g} (the success threshold; no bound)",
         "tube, certified": "none"
         if tube.certified is None
-        else f"{at_most(tube.certified)} ({_CHANNELS[found.channels]})",
+        else f"{at_most(tube.certified)} ({limits})",
         "tube, observed": "not flown" if tube.observed is None else f"{tube.observed:.4g}",
-        "W̄(x)": f"{terms} coefficient{'s' * (terms != 1)} of {found.basis}",
     }
+    if found.coefficients is not None:
+        terms = len(found.coefficients)
+        rows["W̄(x)"] = f"{terms} coefficient{'s' * (terms != 1)} of {found.basis}"
     for name, value in rows.items():
         table.add_row(Text(name), Text(value))
     for line in found.not_proved:

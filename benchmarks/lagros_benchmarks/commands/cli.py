@@ -121,6 +121,14 @@ def bench(
             "again where goal or discs have moved."
         ),
     ] = None,
+    guarantee: Annotated[
+        bool,
+        typer.Option(
+            "--guarantee",
+            help="One body: prove, plan by plan, of how many episodes what they come to; takes up "
+            "to a second for each, policy and bound.",
+        ),
+    ] = False,
     json: Annotated[
         Path | None, file_option("All figures, one object per policy and condition.")
     ] = None,
@@ -202,6 +210,7 @@ def bench(
             jobs=jobs,
             timing_episodes=timing_episodes,
             backend=Backend(backend, address),
+            guarantee=guarantee,
         )
         for name in settings.policies:
             check_policy(name, described.name)

@@ -93,11 +93,12 @@ def pretrained_hash(task: str, *settings: object, folder: Path | None = None) ->
     return digest.hexdigest()[:_DIGITS]
 
 
-def scores_of(task: Task) -> tuple[Score, ...]:
-    """Return what is bounded of the episodes of a task."""
+def scores_of(task: Task, policy: str = "lagros") -> tuple[Score, ...]:
+    """Return what is bounded of the episodes of a task; only (c) has a learning error."""
     error = Score("learning_error", "the largest ||u_L - u*|| of an episode", task.control_unit)
     share = (TUBE_SHARE,) if task.tube_radius(0.0) is not None else ()
-    return (error, TUBE, *share, *((POSITION,) if task.position else ()))
+    learned = (error,) if policy == "lagros" else ()
+    return (*learned, TUBE, *share, *((POSITION,) if task.position else ()))
 
 
 def single_scores(
@@ -129,7 +130,8 @@ def single_scores(
         for at in range(0, count, _CHUNK)
     ]
     values = {
-        one.name: np.concatenate([part[one.name] for part in parts]) for one in scores_of(task)
+        one.name: np.concatenate([part[one.name] for part in parts])
+        for one in scores_of(task, policy)
     }
     failed = int(np.count_nonzero(np.isinf(values[TUBE.name])))
     return EpisodeScores(values, failed, perf_counter() - begun)
@@ -140,20 +142,21 @@ def _chunk(
 ) -> dict[str, FloatArray]:
     episodes = draw_episodes(expert, seeds)
     task, every = episodes.settings, np.arange(len(episodes.seeds))
-    law = law_of(policy, expert, episodes)
+    law = law_of(policy, episodes)
     flights = fly(episodes, law, every, random_pushes(episodes, kind, bound))
     error = flights.states - episodes.plans
     found = {
-        "learning_error": learning_errors(expert, episodes, flights),
         TUBE.name: np.linalg.norm(error, axis=-1).max(axis=1),
         TUBE_SHARE.name: profile(episodes, "tube", every, flights.states).max(axis=1),
         POSITION.name: np.linalg.norm(error[..., list(task.position)], axis=-1).max(axis=1),
     }
+    if policy == "lagros":
+        found["learning_error"] = learning_errors(expert, episodes, flights)
     # Whoever fell, collided or had no plan is infinitely far away.
     without = np.full(len(episodes.unplanned), np.inf)
     return {
         one.name: np.concatenate([np.where(flights.lost, np.inf, found[one.name]), without])
-        for one in scores_of(task)
+        for one in scores_of(task, policy)
     }
 
 
@@ -189,7 +192,7 @@ def single_statements(
     flown = task.defaults.bound if bound is None else bound
     scores = single_scores(task, policy, episodes, kind=kind, bound=flown)
     where = f"{policy}, {conditions(kind, flown)}"
-    return calibrated(scores_of(task), scores, level, where)
+    return calibrated(scores_of(task, policy), scores, level, where)
 
 
 def calibrated(

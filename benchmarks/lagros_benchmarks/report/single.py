@@ -23,6 +23,8 @@ from lagros_benchmarks.run.single import SingleRun
 from lagros_envs.arrays import FloatArray
 from lagros_envs.task import Task
 
+# Above the rounding of a distance, relative.
+_ROUNDING = 1e-9
 _BAND = (10.0, 90.0)  # percentiles of the tracking error over the episodes
 
 
@@ -34,6 +36,8 @@ def figures(run: SingleRun, case: Case) -> Row:
         **_efforts(records),
         **_times(run, case),
         **_tracking(run, case),
+        "guarantee": run.settings.guarantee,
+        **_guarantees(records),
         "units": _units(run.task),
         "counters": added_up({**r.counters, **r.timed_counters} for r in records),
     }
@@ -147,6 +151,31 @@ def _tracking(run: SingleRun, case: Case) -> Row:
         "tracking_error_p10": _rounded(low),
         "tracking_error_p90": _rounded(high),
     }
+
+
+def _guarantees(records: Sequence[EpisodeRecord]) -> Row:
+    """Return what is proved of the episodes; None where no statement is about them."""
+    row: Row = dict.fromkeys(
+        ("guaranteed_rate", "guaranteed_ci95", "bound_over_worst", "guarantees_contradicted")
+    )
+    if any(record.guaranteed is None for record in records):
+        return row
+    kept = [record for record in records if record.guaranteed]
+    bounds = [record.error_bound for record in kept if record.error_bound is not None]
+    found = [r.max_tracking_error for r in kept if r.max_tracking_error is not None]
+    return row | {
+        "guaranteed_rate": len(kept) / len(records),
+        "guaranteed_ci95": wilson_interval(len(kept), len(records)),
+        "bound_over_worst": max(bounds) / max(found) if bounds and max(found) > 0.0 else None,
+        "guarantees_contradicted": sum(map(_contradicts, records)),
+    }
+
+
+def _contradicts(record: EpisodeRecord) -> bool:
+    """Return whether an episode did what is proved to be impossible."""
+    bound, error = record.error_bound, record.max_tracking_error
+    beyond = bound is not None and error is not None and error > bound * (1.0 + _ROUNDING)
+    return bool(beyond or (record.guaranteed and not record.strict_success))
 
 
 def _rounded(curve: FloatArray) -> list[float]:

@@ -36,14 +36,21 @@ _PLAIN_LEGEND = (
 )
 
 
+_GUARANTEE_LEGEND = (
+    " Proved: episodes of which it is proved, for every disturbance up to d̄, that they are strict "
+    "successes; bound: what is proved of the largest ‖x − x_d‖ over what these flights came to."
+)
+
+
 def framed(row: Row) -> bool:
     """Return whether the terminal table has room for a frame in 80 columns."""
-    return _has_tube(row)
+    return _has_tube(row) and not row.get("guarantee")
 
 
 def legend(row: Row) -> str:
     """Return what the columns mean."""
-    return _LEGEND if _has_tube(row) else _PLAIN_LEGEND
+    said = _LEGEND if _has_tube(row) else _PLAIN_LEGEND
+    return said + _GUARANTEE_LEGEND if row.get("guarantee") else said
 
 
 def columns(row: Row) -> tuple[Column, ...]:
@@ -59,17 +66,23 @@ def columns(row: Row) -> tuple[Column, ...]:
         ("Δt ms", "median", lambda row: milliseconds(row["step_time_median_s"])),
         ("Δt ms", "p99", lambda row: milliseconds(row["step_time_p99_s"])),
     )
-    if _has_tube(row):
-        return (
-            *begin,
-            *middle,
-            ("left", "tube %", lambda row: percent(row["tube_violation_rate"])),
+    end: tuple[Column, ...] = ()
+    if row.get("guarantee"):
+        # In place of times, for which there is no room.
+        middle = middle[:-1] if _has_tube(row) else middle[:1]
+        end = (
+            ("proved", "%", lambda row: percent(row["guaranteed_rate"])),
+            ("bound", "/worst", lambda row: number(row["bound_over_worst"])),
         )
+    if _has_tube(row):
+        left: Column = ("left", "tube %", lambda row: percent(row["tube_violation_rate"]))
+        return (*begin, *middle, left, *end)
     return (
         *begin,
         ("coll.", "%", lambda row: percent(row["collision_rate"])),
         ("fell", "%", lambda row: percent(row["fall_rate"])),
         *middle,
+        *end,
     )
 
 
@@ -131,4 +144,19 @@ def markdown_grids(groups: Sequence[Sequence[Row]]) -> list[str]:
             change = ours["versus"]["tube-mpc"]["success_difference"]
             line.append(f"{100 * change:+.1f}")
         contents.append(line)
-    return [markdown_table([*headings, "(c) − (b) [points]"] if paired else headings, contents)]
+    grid = markdown_table([*headings, "(c) − (b) [points]"] if paired else headings, contents)
+    return [grid, *_guarantee_grid(groups)]
+
+
+def _guarantee_grid(groups: Sequence[Sequence[Row]]) -> list[str]:
+    """Return what is proved by bound, of the policies that statements are about."""
+    if not groups[0][0].get("guarantee"):
+        return []
+    # What is proved of a bound is proved for every kind of disturbance.
+    by_bound = {group[0]["bound"]: group for group in reversed(groups)}
+    headings = ["d̄", *(f"{policy_label(row['policy'])}, proved [%]" for row in groups[0])]
+    contents = [
+        [f"{bound:g}", *(percent(row["guaranteed_rate"]) for row in group)]
+        for bound, group in sorted(by_bound.items())
+    ]
+    return [markdown_table(headings, contents)]

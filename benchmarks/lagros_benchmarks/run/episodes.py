@@ -46,6 +46,9 @@ class EpisodeRecord(Keepable):
         left_certified_tube: None: no certified tube of ours is about a flight of this task
             (`claims`).
         max_tracking_error: The largest ||x - x_d||; None without a plan.
+        guaranteed: Whether it was proved, for every disturbance up to d_bar, that the episode is a
+            strict success; None where that was not asked or no statement is about the policy.
+        error_bound: What is proved of max_tracking_error; None where there is no tube.
         counters: What the policy counts, summed over the episode.
         timed_counters: Those of them that depend on the clock; left out of the comparison.
         error: The exception that ended the episode, which is then a failure; None if none did.
@@ -74,6 +77,8 @@ class EpisodeRecord(Keepable):
     tracking_error: FloatArray = field(compare=False, repr=False)
     step_times: FloatArray = field(compare=False, repr=False)
     deadline_misses: int = field(compare=False)
+    guaranteed: bool | None = None
+    error_bound: float | None = None
 
 
 def added_up(counters: Iterable[Mapping[str, int]]) -> dict[str, int]:

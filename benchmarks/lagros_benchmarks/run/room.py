@@ -28,7 +28,9 @@ class Room:
         reproduced: Name of the figure of `lagros reproduce`.
         game: What `lagros watch` plays.
         attack: Episodes and search of an attack, a `worst_case.single.SingleBench`.
-        certify: The certificate.
+        guaranteed: What is proved of the episodes of a policy.
+        certify: The certificate of flights.
+        certify_metric: The certificate of a metric.
         reproduce: Everything from nothing.
         train: How it is learned by reinforcement, a `training.course.SingleCourse`.
         demonstrations: The expert whose episodes `lagros data` writes.
@@ -43,7 +45,9 @@ class Room:
     reproduced: str = "error.png"
     game: str = "lagros_benchmarks.report.watched:SingleGame"
     attack: str = "lagros_benchmarks.worst_case.single:SingleBench"
+    guaranteed: str = "lagros_benchmarks.evidence.columns:guaranteed"
     certify: str = "lagros_benchmarks.evidence.single:certify"
+    certify_metric: str = "lagros_benchmarks.evidence.metric:certify_metric"
     reproduce: str = "lagros_benchmarks.run.reproduce:ReproduceSettings"
     train: str = "lagros_benchmarks.training.course:COURSE"
     demonstrations: str = "lagros_benchmarks.run.demonstrations:SingleExpert"

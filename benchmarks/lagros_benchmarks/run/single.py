@@ -20,6 +20,7 @@ from lagros_benchmarks.run.library import (
     built_policy,
     describe_error,
 )
+from lagros_benchmarks.run.room import room_of
 from lagros_benchmarks.run.settings import BenchmarkSettings, Case, Condition
 from lagros_benchmarks.run.workers import Progress, gather, split
 from lagros_envs.arrays import FloatArray
@@ -119,14 +120,27 @@ class SingleExperiment:
 
     def play(self, case: Case, units: Sequence[NominalPlan]) -> list[EpisodeRecord]:
         """Run episodes one after the other and return their records."""
+        records = self.time(case, units)
+        if not self.settings.proves(case.condition):
+            return records
+        policy = self.policy(case.policy, self.environment(case.condition))
+        seeds = [plan.seed for plan in units]
+        prove = room_of(self.task).part("guaranteed")
+        proved = prove(policy, self.task, seeds, case.condition.bound)
+        if proved is None:
+            return records
+        return [
+            _with_guarantee(record, proved.get(plan.seed), plan.states)
+            for record, plan in zip(records, units, strict=True)
+        ]
+
+    def time(self, case: Case, units: Sequence[NominalPlan]) -> list[EpisodeRecord]:
+        """Return the records alone, for their step times."""
         env = self.environment(case.condition)
         policy = self.policy(case.policy, env)
         return [
             run_episode(env, policy, plan.seed, plan.states, label=case.policy) for plan in units
         ]
-
-    # For the step times of the same records.
-    time = play
 
     def finish(
         self,
@@ -138,6 +152,8 @@ class SingleExperiment:
         episodes = {
             case: [record for part in parts for record in part] for case, parts in outcomes.items()
         }
+        if self.settings.guarantee:
+            episodes = _shared(self.settings, episodes)
         times = self.task.control_period * np.arange(self.task.steps + 1, dtype=np.float64)
         return SingleRun(
             settings=self.settings,
@@ -171,6 +187,33 @@ class SingleExperiment:
         still = np.zeros((self.task.steps + 1, self.task.system.state_dim))
         ClosedLoop(env, policy).rehearse(f"policy {name!r}", options={"nominal": still})
         return policy
+
+
+def _with_guarantee(
+    record: EpisodeRecord, proved: Any, nominal: FloatArray | None
+) -> EpisodeRecord:
+    """Return a record with what is proved of its episode; None: it has no plan."""
+    if proved is None:
+        return replace(record, guaranteed=False)
+    return replace(record, guaranteed=proved.holds, error_bound=proved.error_bound(nominal))
+
+
+def _shared(
+    settings: BenchmarkSettings, episodes: Mapping[Case, list[EpisodeRecord]]
+) -> dict[Case, list[EpisodeRecord]]:
+    """Give all conditions of one bound what is proved for every disturbance up to it."""
+    proved = {
+        (case.policy, case.condition.bound): records
+        for case, records in episodes.items()
+        if settings.proves(case.condition)
+    }
+    return {
+        case: [
+            replace(one, guaranteed=its.guaranteed, error_bound=its.error_bound)
+            for one, its in zip(records, proved[case.policy, case.condition.bound], strict=True)
+        ]
+        for case, records in episodes.items()
+    }
 
 
 def forward_time(policy: BasePolicy) -> float | None:

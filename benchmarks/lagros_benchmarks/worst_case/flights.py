@@ -27,6 +27,7 @@ from lagros_policies.expert import Expert
 from lagros_policies.planning.planner import Planner, planner_of
 from lagros_policies.planning.trajectory import Trajectory
 from lagros_policies.room import shipped_file
+from lagros_policies.tube_mpc import TubeMpcPolicy
 
 # (states (b, n), episodes (b,), steps (b,)) -> controls (b, m).
 Law = Callable[[FloatArray, IntArray, IntArray], FloatArray]
@@ -119,8 +120,15 @@ def plan_of(planner: Planner, scenario: Scenario) -> Trajectory:
     return planner.plan(scenario.initial_state, scenario.goal, discs=scenario.discs)
 
 
-def draw_episodes(expert: Any, seeds: Sequence[int]) -> Episodes:
+def draw_episodes(
+    expert: Any, seeds: Sequence[int], shown: Callable[[Scenario], Scenario] | None = None
+) -> Episodes:
     """Draw the scenario of each seed, as the environment does, and plan it by the expert's planner.
+
+    Args:
+        expert: Whose task and planner.
+        seeds: Seed of each episode.
+        shown: What the planner is shown of a scenario; None for all of it.
 
     Raises:
         RuntimeError: No episode has a plan.
@@ -129,7 +137,8 @@ def draw_episodes(expert: Any, seeds: Sequence[int]) -> Episodes:
     planned = []
     for seed in seeds:
         one = settings.sample(episode_streams(seed).scenario)
-        planned.append((seed, one, plan_of(expert.planner, one)))
+        seen = one if shown is None else shown(one)
+        planned.append((seed, one, plan_of(expert.planner, seen)))
     solved = [entry for entry in planned if entry[2].solved]
     if not solved:
         raise RuntimeError(f"none of the {len(seeds)} episodes has a plan")
@@ -212,15 +221,25 @@ def policy_law(policy: Any, episodes: Episodes) -> Law:
     return law
 
 
-def law_of(policy: str, expert: Any, episodes: Episodes) -> Law:
-    """Return a policy as a law, by its name; "tube-mpc" is u* around the plans."""
-    if policy == "tube-mpc":
-        return tracking_law(expert, episodes)
+def tracked_by(policy: Any) -> Any:
+    """Return the expert whose law around the first plan a policy flies; None if it does not.
+
+    What a user derives from ours is another law, and so is what plans anew.
+    """
+    ours = type(policy).__module__.startswith("lagros_policies.")
+    keeps = ours and isinstance(policy, TubeMpcPolicy) and policy.keeps_plan
+    return policy.expert if keeps and policy.replan_every is None else None
+
+
+def law_of(name: str, episodes: Episodes) -> Law:
+    """Return a policy as a law, by its name; one that tracks a plan is its law around the plans."""
     task = episodes.settings
     env = gym.make(
         task.env_id, settings=task, max_episode_steps=task.steps, disable_env_checker=True
     )
-    return policy_law(make_single_policy(policy, env), episodes)
+    policy = make_single_policy(name, env)
+    expert = tracked_by(policy)
+    return policy_law(policy, episodes) if expert is None else tracking_law(expert, episodes)
 
 
 def observed(

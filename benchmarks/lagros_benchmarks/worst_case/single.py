@@ -27,6 +27,7 @@ from lagros_benchmarks.worst_case.flights import (
     fly,
     policy_law,
     random_pushes,
+    tracked_by,
     tracking_law,
 )
 from lagros_benchmarks.worst_case.goals import (
@@ -47,7 +48,6 @@ from lagros_policies.contraction import ContractionMetric
 from lagros_policies.expert import Expert
 from lagros_policies.planning.planner import planner_of
 from lagros_policies.policy import BasePolicy
-from lagros_policies.tube_mpc import TubeMpcPolicy
 
 # States and plans (b, n) to directions (b, n).
 Adversary = Callable[[FloatArray, FloatArray], FloatArray]
@@ -182,10 +182,8 @@ class SingleBench:
         ClosedLoop(env, make_single_policy(name, env)).rehearse(f"policy {name!r}")
         # Another one flies: a policy may count its calls without being told.
         policy: Any = make_single_policy(name, env)
-        # One that keeps its plan and nothing else: u* around it stands in for it in a search.
-        # What a user derives from ours is another law.
-        ours = type(policy).__module__.startswith("lagros_policies.")
-        self.tracks = ours and isinstance(policy, TubeMpcPolicy) and policy.keeps_plan
+        # The law around its plan stands in for it in a search.
+        self.tracks = tracked_by(policy) is not None
         self.policy = policy
         # One whose metric is a network is held against the tube of its own.
         self.expert = cast(Any, self.policy.expert if self.tracks else self._expert(say))

@@ -5,5 +5,5 @@ from lagros_benchmarks.run.room import Room
 ROOM = Room(
     attack="lagros_benchmarks.tasks.cartpole.attack:CartPoleBench",
     train="lagros_benchmarks.tasks.cartpole.course:COURSE",
-    certify="lagros_benchmarks.tasks.cartpole.certify:certify",
+    certify_metric="lagros_benchmarks.tasks.cartpole.certify:certify_metric",
 )
