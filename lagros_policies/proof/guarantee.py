@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from lagros_envs.dynamics.system import System
 from lagros_envs.numbers import Dual, Interval, exact, functions
 from lagros_envs.numbers.interval import Truth
 from lagros_envs.task import Task
+from lagros_policies.proof.plan_tube import PlanTubes
 
 # Above the rounding of what the environment computes of a state, relative and [m].
 _ROUNDING = 1e-9
@@ -29,24 +30,6 @@ _ROUNDING = 1e-9
 _ROUNDS, _WIDER, _LEAST = 30, 0.1, 1e-9
 # Turns of the direction from a disc to a plan that are tried to part the two [rad].
 _TURNS = (0.0, *(side * turn for turn in (0.1, 0.2, 0.35, 0.5, 0.7) for side in (1.0, -1.0)))
-
-
-class Tubes(Protocol):
-    """What is asked of tubes of p plans; see `plan_tube.PlanTubes`.
-
-    Attributes:
-        closed: Whether there is a tube around the whole plan, shape (p,).
-        outputs: Bounds of |l'e| at the control instants, shape (p, N + 1, q).
-        between: The same over each whole hold, shape (p, N, q).
-        norm: Bounds of ||e|| at the control instants, shape (p, N + 1).
-        deviation: Bounds of |u - u_d|, shape (p, N, m).
-    """
-
-    closed: BoolArray
-    outputs: FloatArray
-    between: FloatArray
-    norm: FloatArray
-    deviation: FloatArray
 
 
 @dataclass(frozen=True)
@@ -90,8 +73,7 @@ def guarantees(
     discs: FloatArray,
     states: FloatArray,
     controls: FloatArray,
-    tubes: Tubes,
-    directions: FloatArray | None = None,
+    tubes: PlanTubes,
 ) -> Guarantees:
     """Return what tubes around plans guarantee of their episodes.
 
@@ -101,12 +83,9 @@ def guarantees(
         discs: Centre and radius of each disc, shape (p, k, 3); of radius zero where there is none.
         states: x_d at the control instants, shape (p, N + 1, n).
         controls: u_d, shape (p, N, m).
-        tubes: The tubes.
-        directions: l of their outputs, shape (q, n), the first n of which are the coordinates; None
-            for these alone.
+        tubes: The tubes, the first n of whose directions are the coordinates.
     """
     n = task.system.state_dim
-    rays = np.eye(n) if directions is None else directions
     closed = np.asarray(tubes.closed, bool)
     # A number in place of what is not known: intervals have no sine of infinity.
     reach = np.where(closed[:, None, None], tubes.outputs[..., :n], 0.0)
@@ -121,7 +100,7 @@ def guarantees(
         closed=closed,
         reaches=distance <= radius,
         upright=closed & _never(task, at),
-        clear=closed & _clear(task, discs, states, tubes, rays),
+        clear=closed & _clear(task, discs, states, tubes),
         within=closed & _within(task, controls, deviation),
         goal_distance=distance,
         state=largest.max(axis=1) * (1.0 + _ROUNDING),
@@ -235,7 +214,7 @@ def _never(task: Task, at: Sequence[Interval]) -> BoolArray:
 
 
 def _goal_distance(
-    task: Task, at: Sequence[Interval], goals: FloatArray, states: FloatArray, tubes: Tubes
+    task: Task, at: Sequence[Interval], goals: FloatArray, states: FloatArray, tubes: PlanTubes
 ) -> FloatArray:
     """Bound the distance from the goal at the end of each plan, shape (p,)."""
     end = [part[:, -1] for part in at]
@@ -259,9 +238,7 @@ def _within(task: Task, controls: FloatArray, deviation: FloatArray) -> BoolArra
     return np.asarray(np.all(kept | (np.isinf(low) & np.isinf(high)), axis=(1, 2)))
 
 
-def _clear(
-    task: Task, discs: FloatArray, states: FloatArray, tubes: Tubes, directions: FloatArray
-) -> BoolArray:
+def _clear(task: Task, discs: FloatArray, states: FloatArray, tubes: PlanTubes) -> BoolArray:
     """Return which plans keep every straight way of a step in their tube off the discs, (p,).
 
     A line between disc and way parts the two: the way lies beyond it if both of its ends do, for
@@ -283,21 +260,19 @@ def _clear(
     for turn in _TURNS:
         cosine, sine = math.cos(turn), math.sin(turn)
         ray = nearest @ np.array([[cosine, sine], [-sine, cosine]])
-        reach = _reach(task, tubes, directions, ray)
+        reach = _reach(task, tubes, ray)
         first = np.einsum("...c,...c->...", begin - centre, ray) - reach[0]
         last = np.einsum("...c,...c->...", end - centre, ray) - reach[1]
         apart |= np.minimum(first, last) >= contact * (1.0 + _ROUNDING) + _ROUNDING
     return np.asarray(apart.all(axis=(1, 2)))
 
 
-def _reach(
-    task: Task, tubes: Tubes, directions: FloatArray, ray: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _reach(task: Task, tubes: PlanTubes, ray: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Bound ray'e of the position at both ends of each step, for rays (p, N, k, 2) of length one.
 
     A ray is a sum of any two directions of the tube in the plane: its bound that of theirs.
     """
-    place = list(task.position)
+    place, directions = list(task.position), tubes.directions
     others = np.delete(directions, place, axis=1)
     flat = np.flatnonzero(~others.any(axis=1) & directions.any(axis=1))
     ends = tubes.outputs[:, :-1], tubes.outputs[:, 1:]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -74,9 +73,10 @@ def linear_loop(task, weights, count=3, flown=1.0, shrunk=1.0):
             directions=directions_of(task),
             control_low=np.array(task.control_low),
             control_high=np.array(task.control_high),
+            control_centre=np.array(task.control_centre),
         )
         sizes = {name: shrunk * getattr(found, name) for name in ("outputs", "norm", "between")}
-        return SimpleNamespace(closed=found.closed, deviation=found.deviation, **sizes)
+        return replace(found, **sizes)
 
     return Loop(episodes, law, tubes)
 
@@ -299,7 +299,7 @@ def test_a_guarantee_that_a_flight_contradicts_is_counted(monkeypatch):
 
 @pytest.mark.usefixtures("faked")
 def test_a_run_that_goes_on_keeps_its_guarantees(tmp_path):
-    settings = replace(SETTINGS, policies=("tube-mpc",), chunk=2)
+    settings = replace(SETTINGS, policies=("tube-mpc",), bounds=(0.1,), episodes=4, chunk=2)
     whole = run_benchmark(settings)
     kept = kept_in(tmp_path, settings)
     run_benchmark(settings, kept=kept)

@@ -103,6 +103,7 @@ BENCH = {
     "--backend": Row(NAMES),
     "--address": Row(("",), ("cartpole --backend dask",), ("cartpole",), "tcp://127.0.0.1:1"),
     "--timing-episodes": Row(POSITIVE_WHOLE),
+    "--guarantee": Row(FLAG, CARTPOLE, SPACECRAFT),
     "--replan-every": Row(POSITIVE_WHOLE, CARTPOLE, ("spacecraft", "cartpole --policies lqr"), "2"),
     "--json": Row(WRITTEN),
     "--csv": Row(WRITTEN),
@@ -152,7 +153,7 @@ EXPORT = {
 }
 CERTIFY = {
     "--metric": Row(READ),
-    "--policy": Row((*NAMES, "lqr")),
+    "--policy": Row(NAMES),
     "--json": Row(WRITTEN),
     "--bound": Row((*POSITIVE, *BOUND)),
     "--episodes": Row(WHOLE),

@@ -42,6 +42,7 @@ def tubes_of(task, states, sizes, directions=None, push=0.1):
     outputs = box @ np.abs(directions).T
     return SimpleNamespace(
         closed=np.ones(count, bool),
+        directions=directions,
         outputs=outputs,
         norm=np.linalg.norm(box, axis=-1),
         between=np.maximum(outputs[:, :-1], outputs[:, 1:]),
@@ -149,7 +150,7 @@ def test_slanted_directions_part_what_a_box_does_not():
         if directions is not None:
             # The errors of x and y are of opposite signs.
             tubes.outputs[..., -1] = 0.05
-        found = guarantees(task, states[:, -1], discs, states, controls, tubes, directions)
+        found = guarantees(task, states[:, -1], discs, states, controls, tubes)
         assert found.clear.tolist() == [clear]
 
 

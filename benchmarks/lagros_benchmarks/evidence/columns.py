@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lagros_benchmarks.evidence.loops import directions_of, is_spoken_of, loop_of
+from lagros_benchmarks.evidence.loops import is_spoken_of, loop_of
 from lagros_envs.arrays import FloatArray
 from lagros_envs.task import Task
 from lagros_policies.proof.guarantee import guarantees
@@ -64,15 +64,7 @@ def guaranteed(
     if loop.tubes is None:
         return None
     flown, tubes = loop.episodes, loop.tubes(bound)
-    proved = guarantees(
-        task,
-        flown.goals,
-        flown.discs,
-        flown.plans,
-        flown.controls,
-        tubes,
-        directions_of(task),
-    )
+    proved = guarantees(task, flown.goals, flown.discs, flown.plans, flown.controls, tubes)
     return {
         seed: Guaranteed(bool(proved.holds[index]), flown.plans[index], proved.norm[index])
         for index, seed in enumerate(flown.seeds)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lagros_benchmarks.evidence.loops import Loop, directions_of
+from lagros_benchmarks.evidence.loops import Loop
 from lagros_benchmarks.worst_case.flights import Flights, fly, parts_of, random_pushes
 from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_benchmarks.worst_case.single import SingleTarget
@@ -16,7 +16,8 @@ from lagros_envs.arrays import BoolArray, FloatArray, IntArray
 from lagros_envs.numbers import functions
 from lagros_envs.task import Task
 from lagros_policies.contraction.certificate import Stopwatch
-from lagros_policies.proof.guarantee import Guarantees, Tubes, guarantees
+from lagros_policies.proof.guarantee import Guarantees, guarantees
+from lagros_policies.proof.plan_tube import PlanTubes
 
 # Flights that a search may spend on each episode, and how many sequences climb side by side.
 SEARCH = SearchSettings("gradient", budget=240, restarts=3)
@@ -59,7 +60,7 @@ class Evidence:
     """
 
     asked: int
-    tubes: Tubes | None
+    tubes: PlanTubes | None
     proved: Guarantees | None
     worst: Worst
     flights: tuple[Flights, ...]
@@ -107,7 +108,7 @@ class TubeTarget(SingleTarget):
         tubes: The tubes; None for none.
     """
 
-    tubes: Tubes | None = None
+    tubes: PlanTubes | None = None
     record: _Record = field(init=False)
 
     def __post_init__(self) -> None:
@@ -167,13 +168,7 @@ def evidence_of(
     proved = None
     if tubes is not None:
         proved = guarantees(
-            flown.settings,
-            flown.goals,
-            flown.discs,
-            flown.plans,
-            flown.controls,
-            tubes,
-            directions_of(flown.settings),
+            flown.settings, flown.goals, flown.discs, flown.plans, flown.controls, tubes
         )
     proof_seconds = watch.lap()
     target = TubeTarget(flown, loop.law, "error", bound, tubes=tubes)

@@ -25,8 +25,7 @@ from lagros_benchmarks.worst_case.flights import (
 )
 from lagros_envs.arrays import FloatArray
 from lagros_envs.task import Scenario, Task
-from lagros_policies.proof.guarantee import Tubes
-from lagros_policies.proof.plan_tube import plan_tubes
+from lagros_policies.proof.plan_tube import PlanTubes, plan_tubes
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Loop:
 
     episodes: Episodes
     law: Law
-    tubes: Callable[[float], Tubes] | None
+    tubes: Callable[[float], PlanTubes] | None
     why: str = ""
 
 
@@ -91,7 +90,7 @@ def shown(scenario: Scenario) -> Scenario:
     )
 
 
-def _tubes(task: Task, episodes: Episodes, gains: FloatArray, bound: float) -> Tubes:
+def _tubes(task: Task, episodes: Episodes, gains: FloatArray, bound: float) -> PlanTubes:
     return plan_tubes(
         task.system,
         task.control_period,
@@ -102,6 +101,7 @@ def _tubes(task: Task, episodes: Episodes, gains: FloatArray, bound: float) -> T
         directions=directions_of(task),
         control_low=np.array(task.control_low),
         control_high=np.array(task.control_high),
+        control_centre=np.array(task.control_centre),
     )
 
 
