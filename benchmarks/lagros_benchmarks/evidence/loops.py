@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -25,7 +26,11 @@ from lagros_benchmarks.worst_case.flights import (
 )
 from lagros_envs.arrays import FloatArray
 from lagros_envs.task import Scenario, Task
+from lagros_policies.expert import Expert
+from lagros_policies.lagros import LagrosPolicy
+from lagros_policies.proof.network_steering import network_flight
 from lagros_policies.proof.plan_tube import PlanTubes, plan_tubes
+from lagros_policies.proof.steering import Controller
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ def loop_named(name: str, task: Task, seeds: Sequence[int]) -> Loop:
 
 def is_spoken_of(policy: Any) -> bool:
     """Return whether a statement of ours may be about the flights of a policy."""
-    return tracked_by(policy) is not None
+    return tracked_by(policy) is not None or type(policy) is LagrosPolicy
 
 
 def loop_of(policy: Any, task: Task, seeds: Sequence[int]) -> Loop:
@@ -66,17 +71,38 @@ def loop_of(policy: Any, task: Task, seeds: Sequence[int]) -> Loop:
         UnfitError: The policy keeps a memory of its own.
     """
     tracker = tracked_by(policy)
-    expert = expert_of(task) if tracker is None else tracker
-    episodes = draw_episodes(expert, seeds, shown)
-    if tracker is None:
-        why = f"no statement of ours is about {policy.name}: no tube is known for its loop"
-        return Loop(episodes, policy_law(policy, episodes), None, why)
-    law = tracking_law(tracker, episodes)
-    gains = getattr(tracker.track(episodes.plans, episodes.controls), "feedback", None)
-    if gains is None:
-        why = f"no tube is known for the law of {policy.name}, which is no linear gain"
+    episodes = draw_episodes(expert_of(task) if tracker is None else tracker, seeds, shown)
+    if tracker is not None:
+        return _around_plans(policy.name, tracker, episodes)
+    law = policy_law(policy, episodes)
+    if is_spoken_of(policy):
+        return _around_flights(policy, law, episodes)
+    why = f"no statement of ours is about {policy.name}: no tube is known for its loop"
+    return Loop(episodes, law, None, why)
+
+
+def _around_plans(name: str, expert: Expert, episodes: Episodes) -> Loop:
+    """Return the loop of a law around the plans that it tracks."""
+    law = tracking_law(expert, episodes)
+    gains = expert.track(episodes.plans, episodes.controls).feedback
+    # A projected gain is another law where the projection acts, which nothing here excludes.
+    if gains is None or expert.law_name == "projected":
+        why = f"no statement of ours is about {name}: no tube is known for a law that is no gain"
         return Loop(episodes, law, None, why)
-    return Loop(episodes, law, lambda bound: _tubes(task, episodes, gains, bound))
+    return Loop(episodes, law, partial(_tubes, episodes, gains))
+
+
+def _around_flights(policy: LagrosPolicy, law: Law, episodes: Episodes) -> Loop:
+    """Return the loop of a network around what it does when nothing disturbs it."""
+    task = episodes.settings
+    asked = zip(episodes.initial_states, episodes.goals, episodes.discs, strict=True)
+    try:
+        flight = network_flight(task, policy.network, [Scenario(*one) for one in asked])
+    except (TypeError, ValueError) as error:
+        why = f"no statement of ours is about {policy.name} on {task.name}: {error}"
+        return Loop(episodes, law, None, why)
+    around = replace(episodes, plans=flight.states, controls=flight.controls)
+    return Loop(around, law, partial(_tubes, around, flight.steering))
 
 
 def shown(scenario: Scenario) -> Scenario:
@@ -90,13 +116,14 @@ def shown(scenario: Scenario) -> Scenario:
     )
 
 
-def _tubes(task: Task, episodes: Episodes, gains: FloatArray, bound: float) -> PlanTubes:
+def _tubes(episodes: Episodes, law: FloatArray | Controller, bound: float) -> PlanTubes:
+    task = episodes.settings
     return plan_tubes(
         task.system,
         task.control_period,
         episodes.plans,
         episodes.controls,
-        gains,
+        law,
         bound,
         directions=directions_of(task),
         control_low=np.array(task.control_low),
