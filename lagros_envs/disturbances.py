@@ -25,6 +25,7 @@ from lagros_envs.values import ByValue
 GUST_CORRELATION_TIME = 1.0  # [s]
 GUST_SPREAD = 0.6  # stationary norm (root mean square) as a share of the bound, before clipping
 SINUSOID_RATES = (0.5, 5.0)  # [rad/s]
+SWITCHING_TIME = 1.5  # [s]
 # Episodes that are worked on at once: what they draw then stays in the cache.
 _BLOCK = 64
 
@@ -141,6 +142,17 @@ def _gust(numbers: FloatArray, steps: int, channels: int, period: float) -> Floa
     return into_unit_ball(path)
 
 
+def switching_steps(period: float) -> int:
+    """Return the control steps for which `switching` keeps a direction; period in [s]."""
+    return max(1, round(SWITCHING_TIME / period))
+
+
+def _switching(numbers: FloatArray, steps: int, channels: int, period: float) -> FloatArray:
+    # One direction a step is drawn, whatever the period, of which the first few are used.
+    directions = _directions(numbers, steps, channels)
+    return directions[..., np.arange(steps) // switching_steps(period), :]
+
+
 OPEN_LOOP: dict[str, OpenLoop] = {
     "none": OpenLoop(lambda steps, channels: 0, _draw_normals, _none),
     "uniform": OpenLoop(lambda steps, channels: steps * (channels + 1), _draw_uniform, _uniform),
@@ -148,6 +160,7 @@ OPEN_LOOP: dict[str, OpenLoop] = {
     "constant": OpenLoop(lambda steps, channels: channels, _draw_normals, _constant),
     "sinusoid": OpenLoop(lambda steps, channels: channels + 2, _draw_sinusoid, _sinusoid),
     "gust": OpenLoop(lambda steps, channels: steps * channels, _draw_normals, _gust),
+    "switching": OpenLoop(lambda steps, channels: steps * channels, _draw_normals, _switching),
 }
 KINDS = (*OPEN_LOOP, "worst")
 

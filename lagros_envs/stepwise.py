@@ -19,6 +19,7 @@ from lagros_envs.disturbances import (
     GUST_SPREAD,
     SINUSOID_RATES,
     Disturbance,
+    switching_steps,
 )
 
 # Numbers of draws in a row, where there are fewer worlds: a call costs as much as a hundred draws.
@@ -54,7 +55,7 @@ class StepwiseDisturbance:
         shape = self._disturbed.size, worlds
         self._count = max(1, _BLOCK // worlds)
         self._period = period
-        # What a world keeps over its episode: a direction, or the gust as it is now.
+        # What a world keeps: a direction, or the gust as it is now.
         self._kept = np.zeros(shape)
         self._rate, self._phase = np.zeros(worlds), np.zeros(worlds)
         # A realisation of a kind that looks at nothing, some steps in advance.
@@ -64,7 +65,7 @@ class StepwiseDisturbance:
 
     def begin(self, worlds: IntArray, rng: np.random.Generator) -> None:
         """Draw what the episodes of these worlds begin with, from the generator of all."""
-        if self._kind in ("none", "uniform", "sphere"):
+        if self._kind in ("none", "uniform", "sphere", "switching"):
             return
         normals = rng.standard_normal((self._disturbed.size, worlds.size))
         if self._kind == "gust":
@@ -110,6 +111,10 @@ class StepwiseDisturbance:
                 lengths = np.sqrt(np.add.reduce(now * now, axis=0))
                 gust: FloatArray = now * (INSIDE / np.maximum(lengths, 1.0))
                 return gust
+            case "switching":
+                due = np.asarray(steps) % switching_steps(self._period) == 0
+                self._kept = np.where(due, self._drawn(rng), self._kept)
+                return self._kept
             case _:
                 return self._kept
 
@@ -160,4 +165,9 @@ def _normals(rng: np.random.Generator, shape: tuple[int, ...]) -> FloatArray:
     return rng.standard_normal(shape)
 
 
-_LAWS: dict[str, Any] = {"uniform": _ball, "sphere": _sphere, "gust": _normals}
+_LAWS: dict[str, Any] = {
+    "uniform": _ball,
+    "sphere": _sphere,
+    "gust": _normals,
+    "switching": _sphere,
+}

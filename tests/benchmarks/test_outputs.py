@@ -142,6 +142,7 @@ def test_percent_rounds_to_certainty_only_if_it_is(rate, text):
 
 def test_the_paper_letters_its_methods():
     assert formats.policy_label("tube-mpc") == "(b) tube-mpc"
+    assert formats.policy_label("tube-mpc:gain") == "(b) gain"
     assert formats.policy_label("runs/ppo.zip") == "ppo.zip"
     assert formats.policy_label("a_package.policies:Mine") == "Mine"
 

@@ -185,6 +185,23 @@ def test_gust_decorrelates_in_a_second_and_is_stationary():
         assert correlation == pytest.approx(math.exp(-lag * PERIOD / 1.0), abs=0.04)
 
 
+def test_switching_keeps_a_direction_of_full_length_for_a_second_and_a_half():
+    pushes = np.stack([realise("switching", 0.5, seed=seed, steps=90) for seed in range(300)])
+    np.testing.assert_allclose(norms(pushes), 0.5, rtol=1e-9)
+    changed = np.any(np.diff(pushes, axis=1) != 0.0, axis=-1)
+    np.testing.assert_array_equal(
+        changed, np.broadcast_to(np.arange(1, 90) % 15 == 0, changed.shape)
+    )
+    # One direction says nothing of the next.
+    turns = np.sum(pushes[:, 14] * pushes[:, 15], axis=-1) / 0.25
+    assert abs(turns.mean()) < 4.0 * 0.5 / math.sqrt(300)
+    # A coarser control period keeps them as long.
+    rng = np.random.default_rng(0)
+    coarse = Disturbance("switching", 0.5, ALL).realise(rng, 12, 0.5)
+    np.testing.assert_array_equal(coarse[:3], np.repeat(coarse[:1], 3, axis=0))
+    assert np.any(coarse[3] != coarse[2])
+
+
 @pytest.mark.parametrize("kind", sorted(OPEN_LOOP))
 @given(seed=seeds, bound=st.floats(1e-3, 10.0), factor=st.floats(1.0, 100.0))
 def test_a_larger_bound_scales_the_same_realisation(kind, seed, bound, factor):

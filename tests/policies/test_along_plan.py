@@ -11,6 +11,7 @@ import scipy.linalg
 import lagros_policies
 from lagros_envs.dynamics import hold_step, linearise_hold
 from lagros_envs.task import Feedback
+from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.contraction.along_plan import (
     contraction_condition,
     plan_metric,
@@ -18,6 +19,7 @@ from lagros_policies.contraction.along_plan import (
 )
 from lagros_policies.contraction.control import contracting_set, nearest_contracting
 from lagros_policies.expert import LAWS, SHIPPED_LAW, Expert
+from lagros_policies.policy import named_policies
 from tests.policies.toys import Drive, Slide
 
 DECAY = 0.06
@@ -229,3 +231,16 @@ def test_laws_are_policies_by_name():
         lagros_policies.make("tube-mpc:gian", env)
     with pytest.raises(ValueError, match=r"law='gian' is not known.*Did you mean 'gain'"):
         lagros_policies.make("tube-mpc", env, law="gian")
+
+
+def test_ablation_stands_for_the_parts_of_what_is_shipped():
+    task = CartPoleSettings()
+    parts = named_policies(task, ["ablation"])
+    assert {f"tube-mpc:{law}" for law in LAWS if law != "lqr"} < set(parts)
+    assert "lqr-plan" in parts
+    assert "tube-mpc" not in parts
+    assert named_policies(task, ["lqr-plan", "ablation", "mine:Own"]) == (
+        "lqr-plan",
+        *(name for name in parts if name != "lqr-plan"),
+        "mine:Own",
+    )

@@ -79,7 +79,9 @@ def bench(
     policies: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME[,NAME]", help="{policies} Or a stable-baselines3 .zip, or module:Class."
+            metavar="NAME[,NAME]",
+            help="{policies} Or ablation: all with a colon, and lqr-plan. Or a stable-baselines3 "
+            ".zip, or module:Class.",
         ),
     ] = None,
     episodes: Annotated[
@@ -170,6 +172,7 @@ def bench(
     from lagros_envs.registry import find_task
     from lagros_policies.backends import Backend
     from lagros_policies.naming import listed_names
+    from lagros_policies.policy import named_policies
 
     outputs = Outputs(json, csv, latex, markdown, figure, episodes_file, scene, scene_world)
     named = None if policies is None else listed_names(policies)
@@ -178,6 +181,7 @@ def bench(
         described: Any = find_task(task)
         if named is not None and "" in named:
             raise ValueError("--policies: an entry is empty; write them as a,b")
+        named = None if named is None else named_policies(described, named)
         if scene is None:
             refuse_options(["--scene-world"], "no --scene is asked for")
         if disturbance.strip() == "none":

@@ -45,7 +45,7 @@ def export(
     episodes: Annotated[int, typer.Option(help="Episodes.")] = 100,
     seed: Annotated[int, typer.Option(help="Seed; its episodes never occur in evaluation.")] = 0,
     disturbance: Annotated[
-        str, typer.Option(help="Of none, uniform, sphere, constant, sinusoid, gust.")
+        str, typer.Option(help="Of none, uniform, sphere, constant, sinusoid, gust, switching.")
     ] = "uniform",
     bound: Annotated[float | None, BOUND] = None,
     out: Annotated[

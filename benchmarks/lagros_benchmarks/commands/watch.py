@@ -32,7 +32,7 @@ def watch(
         str | None, typer.Option(help="Of paper, released, crossing, open, swarm. (default: paper)")
     ] = None,
     disturbance: Annotated[
-        str, typer.Option(help="Of none, uniform, sphere, constant, sinusoid, gust.")
+        str, typer.Option(help="Of none, uniform, sphere, constant, sinusoid, gust, switching.")
     ] = "uniform",
     bound: Annotated[float | None, BOUND] = None,
     seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,

@@ -21,9 +21,13 @@ Column = tuple[str, str, Callable[[Row], str]]
 
 
 def policy_label(policy: str, longest: int = LONGEST_LABEL) -> str:
-    """Return the name of a policy in tables and figures: letter and name, its file or its class."""
-    if policy in _LETTERS:
-        return f"{_LETTERS[policy]} {policy}"
+    """Return the name of a policy in tables and figures: letter and name, its file or its class.
+
+    Of a part of what is shipped, such as tube-mpc:gain, the letter of the whole.
+    """
+    whole, _, part = policy.partition(":")
+    if whole in _LETTERS and not policy.endswith(".zip"):
+        return f"{_LETTERS[whole]} {part or whole}"
     name = Path(policy).name if policy.endswith(".zip") else policy.rpartition(":")[2]
     return name if len(name) <= longest else name[: longest - 1] + "…"
 
