@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -92,6 +92,17 @@ def user_class(name: str) -> UserClass | None:
     if not attribute.isidentifier():
         raise ValueError(f"policy {name!r}: {attribute!r} is no class; write {module}:Class")
     return UserClass(module, attribute)
+
+
+def with_parts(given: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
+    """Return names of policies with what "ablation" stands for in its place.
+
+    These are the known ones that are no row of a main table: the parts of what is shipped
+    (`tube-mpc:gain`, ...), and `lqr-plan`, a plain regulator around the same plans.
+    """
+    parts = [name for name in known if ":" in name or name == "lqr-plan"]
+    names = [one for name in given for one in (parts if name == "ablation" else [name])]
+    return tuple(dict.fromkeys(names))
 
 
 def is_code(name: str) -> bool:

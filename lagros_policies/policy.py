@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar, Literal, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
@@ -276,17 +276,6 @@ def row_memories(
 def policy_names(task: Described) -> tuple[str, ...]:
     """Return the names of the policies of a task."""
     return tuple(_places(task))
-
-
-def named_policies(task: Described, given: Sequence[str]) -> tuple[str, ...]:
-    """Return names of policies with what "ablation" stands for in its place.
-
-    These are the laws of a task that are no row of its main table: the parts of what is shipped
-    (`tube-mpc:gain`, ...) and `lqr-plan`, a plain regulator around the same plans.
-    """
-    parts = [name for name in policy_names(task) if ":" in name or name == "lqr-plan"]
-    names = [one for name in given for one in (parts if name == "ablation" else [name])]
-    return tuple(dict.fromkeys(names))
 
 
 def _places(task: Described) -> dict[str, str]:

@@ -239,7 +239,7 @@ def test_a_figure_says_what_it_cannot_draw(rows, grid_rows, tmp_path):
 
 
 def test_known_policies_always_look_the_same_and_all_differ():
-    known = dict.fromkeys((*NAMES, *SPACECRAFT_NAMES))
+    known = dict.fromkeys(name for name in (*NAMES, *SPACECRAFT_NAMES) if ":" not in name)
     names = ["x.zip", *known, "y.zip", "mine:A", "mine:B", "mine:C"]
     found = canvas.styles(names)
     for name in known:

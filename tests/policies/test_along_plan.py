@@ -19,7 +19,8 @@ from lagros_policies.contraction.along_plan import (
 )
 from lagros_policies.contraction.control import contracting_set, nearest_contracting
 from lagros_policies.expert import LAWS, SHIPPED_LAW, Expert
-from lagros_policies.policy import named_policies
+from lagros_policies.naming import with_parts
+from lagros_policies.policy import policy_names
 from tests.policies.toys import Drive, Slide
 
 DECAY = 0.06
@@ -234,12 +235,12 @@ def test_laws_are_policies_by_name():
 
 
 def test_ablation_stands_for_the_parts_of_what_is_shipped():
-    task = CartPoleSettings()
-    parts = named_policies(task, ["ablation"])
+    known = policy_names(CartPoleSettings())
+    parts = with_parts(["ablation"], known)
     assert {f"tube-mpc:{law}" for law in LAWS if law != "lqr"} < set(parts)
     assert "lqr-plan" in parts
     assert "tube-mpc" not in parts
-    assert named_policies(task, ["lqr-plan", "ablation", "mine:Own"]) == (
+    assert with_parts(["lqr-plan", "ablation", "mine:Own"], known) == (
         "lqr-plan",
         *(name for name in parts if name != "lqr-plan"),
         "mine:Own",

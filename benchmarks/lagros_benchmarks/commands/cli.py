@@ -171,8 +171,8 @@ def bench(
     from lagros_envs.checks import check_whole
     from lagros_envs.registry import find_task
     from lagros_policies.backends import Backend
-    from lagros_policies.naming import listed_names
-    from lagros_policies.policy import named_policies
+    from lagros_policies.naming import listed_names, with_parts
+    from lagros_policies.policy import policy_names
 
     outputs = Outputs(json, csv, latex, markdown, figure, episodes_file, scene, scene_world)
     named = None if policies is None else listed_names(policies)
@@ -181,7 +181,7 @@ def bench(
         described: Any = find_task(task)
         if named is not None and "" in named:
             raise ValueError("--policies: an entry is empty; write them as a,b")
-        named = None if named is None else named_policies(described, named)
+        named = None if named is None else with_parts(named, policy_names(described))
         if scene is None:
             refuse_options(["--scene-world"], "no --scene is asked for")
         if disturbance.strip() == "none":
