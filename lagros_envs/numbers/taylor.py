@@ -120,11 +120,12 @@ class Monomials:
         return self._degrees[degree]
 
     @cached_property
-    def cuts(self) -> list[list[int]]:
-        """Which kinds are cut off, times each kind."""
-        kept = {(self._kind(i), self._kind(j)) for i, j in zip(self.left, self.right, strict=True)}
-        size = range(len(self.kinds))
-        return [[j for j in size if (i, j) not in kept] for i in size]
+    def cuts(self) -> FloatArray:
+        """Which products of two kinds are cut off, as a whole: ones in a matrix of zeros."""
+        cut = np.ones((len(self.kinds),) * 2)
+        for one, two in zip(self.left, self.right, strict=True):
+            cut[self._kind(one), self._kind(two)] = 0.0
+        return cut
 
     def _kind(self, place: int) -> int:
         return int(np.searchsorted(self.starts, place, side="right")) - 1
@@ -224,10 +225,7 @@ class TaylorModel:
         products *= two.parts[kept.right]
         parts = np.add.reduceat(products, kept.sums, axis=0)
         sizes, others = one.norms, two.norms
-        cut = np.zeros(np.shape(self.rest))
-        for row, columns in enumerate(kept.cuts):
-            if columns:
-                cut = cut + sizes[row] * others[columns].sum(axis=0)
+        cut = (sizes * np.tensordot(kept.cuts, others, axes=1)).sum(axis=0)
         first, second = sizes.sum(axis=0), others.sum(axis=0)
         rest = one.rest * (second + two.rest) + first * two.rest
         rest = (rest + cut + _PRODUCT_ERROR * (one.size * two.size)) * _WIDER
