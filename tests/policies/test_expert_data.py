@@ -71,6 +71,31 @@ def test_plans_are_those_of_the_planner(data, oracle):
     assert len(np.unique(data.plan_states[:, -1, 0])) == 8
 
 
+def test_gains_are_the_slopes_of_the_law(data, metric):
+    expert = CartPoleExpert(metric)
+    tracked = expert.track(data.plan_states, data.plan_controls)
+    state, step = data.observation[:, task.STATE], steps_of(data)
+    way, slope = data.moves(CartPoleSettings(), np.random.default_rng(0))
+    assert way.shape == state.shape
+    assert np.all(np.any(way != 0.0, axis=1))
+    ends = [expert.control(tracked, data.plan, step, state + end * way) for end in (1e-3, -1e-3)]
+    np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-3, atol=1e-6)
+    # As large as the errors are.
+    error = state - data.plan_states[data.plan, step]
+    np.testing.assert_allclose(way.std(axis=0), error.std(axis=0), rtol=0.3)
+
+
+def test_no_slope_is_learned_where_the_label_is_not_the_linear_law(data):
+    control = data.control.copy()
+    control[::2] += 1.0
+    way, slope = replace(data, control=control).moves(CartPoleSettings(), np.random.default_rng(0))
+    assert not way[::2].any()
+    assert not slope[::2].any()
+    assert way[1::2].any(axis=1).all()
+    with pytest.raises(ValueError, match="no linear gain"):
+        replace(data, gain=data.gain[..., :0]).moves(CartPoleSettings(), np.random.default_rng(0))
+
+
 def test_observations_are_what_the_environment_shows(data):
     steps = steps_of(data)
     assert data.observation[:, task.TIME] == pytest.approx(0.1 * steps)

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from lagros_envs import register_task
-from lagros_envs.numbers import functions
+from lagros_envs.numbers import Dual, functions
+from lagros_envs.registry import find_task
 from lagros_envs.tasks.pvtol.task import PvtolSettings
 from lagros_policies.learning.dataset import ExpertDataSettings, generate
-from lagros_policies.learning.features import seen, view_of
+from lagros_policies.learning.features import moved, seen, view_of
 from lagros_policies.learning.metric import MetricSettings, metric_settings
 from lagros_policies.learning.network_policy import NetworkPolicy
 from lagros_policies.learning.networks import Mlp
@@ -28,6 +29,26 @@ def a_network(task, seed=0, size=0.3):
     inputs, outputs = len(view_of(task).names), task.system.control_dim
     weights = [rng.normal(size=(inputs, 8)) / inputs, size * rng.normal(size=(8, outputs))]
     return Mlp(weights, [np.zeros(8), np.array(task.control_centre)])
+
+
+@pytest.mark.parametrize("name", ["cartpole", "pvtol"])
+def test_features_move_as_duals_say(name):
+    """Central differences against exact derivatives, where the features are differentiable."""
+    task, rng = find_task(name), np.random.default_rng(4)
+    see, rows = view_of(task), observed(task, rng).astype(np.float64)
+    way = np.zeros_like(rows)
+    way[:, task.layout.state] = rng.normal(size=(len(rows), task.system.state_dim))
+    found = moved(see, rows, way)
+    assert found.shape == (len(rows), len(see.names))
+    for row, direction, one in zip(rows, way, found, strict=True):
+        given = [Dual(*pair) for pair in zip(row.tolist(), direction.tolist(), strict=True)]
+        # Discs and episode stand still: plain numbers, whose comparisons are plain, too.
+        still = range(task.layout.size)[task.layout.state]
+        for index in set(range(len(row))) - set(still):
+            given[index] = float(row[index])
+        features = see(given, functions).features
+        exact = [each.gradient if isinstance(each, Dual) else 0.0 for each in features]
+        np.testing.assert_allclose(one, exact, rtol=1e-5, atol=1e-5)
 
 
 def observed(task, rng, count=30):

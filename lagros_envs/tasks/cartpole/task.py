@@ -82,7 +82,7 @@ class CartPoleSettings(Task):
         early_control=(5.0,),
         settling=1.6,
     )
-    learning = Learning()
+    learning = Learning(samples=250_000, epochs=40, scheduled=True, slope_weight=0.3)
     short_goal = (0,)
 
     def __post_init__(self) -> None:
