@@ -113,16 +113,18 @@ class Expansion:
         )  # fmt: skip
 
 
-def box_inputs(centre: FloatArray, reach: FloatArray) -> Expansion:
-    """Return x itself over boxes, as inputs of a network.
+def box_inputs(centre: FloatArray, reach: FloatArray, axes: FloatArray | None = None) -> Expansion:
+    """Return y = centre + T x over boxes of x, as inputs of a network.
 
     Args:
-        centre: Middle of each box, shape (b, n).
-        reach: Half its sides, shape (b, n), not negative.
+        centre: Middle of the inputs, shape (b, n).
+        reach: Half the sides of each box of x about zero, shape (b, n), not negative.
+        axes: T, shape (b, n, n); the identity if left out: then the inputs lie in the box.
     """
     batch, n = centre.shape
-    slope = exact(np.broadcast_to(np.eye(n), (batch, n, n)))
-    values = exact(centre) + symmetric(reach)
+    turn = np.broadcast_to(np.eye(n) if axes is None else axes, (batch, n, n))
+    slope = exact(np.swapaxes(turn, 1, 2))
+    values = exact(centre) + symmetric(above(np.einsum("bij,bj->bi", np.abs(turn), reach)))
     curves = exact(np.zeros((batch, n * (n + 1) // 2, n)))
     rounding = above(_UNIT_32 * abs(values).upper)
     return Expansion(centre, reach, exact(centre), slope, values, slope, curves, rounding)

@@ -122,7 +122,7 @@ class NetworkSteering:
         reach, centre = errors.radius, state + errors.centre
         unseen = above(SINGLE * (np.abs(centre) + reach) + DOUBLE * np.abs(centre))
         if self._law is None:
-            found = self._curved(step, centre, above(reach + unseen), *_axes(errors, unseen))
+            found = self._curved(step, centre, above(reach + unseen), *axes_along(errors, unseen))
         else:
             found = self._enclosed(step, centre, above(reach + unseen))
         offset = found.offset - control
@@ -234,7 +234,7 @@ class NetworkSteering:
         return AffineEnclosure(centre, reach, total.midpoint, by_state, above(error))
 
 
-def _axes(errors: ErrorSet, unseen: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def axes_along(errors: ErrorSet, unseen: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return axes along which a set of errors lies, and how far it goes along them.
 
     Returns:
