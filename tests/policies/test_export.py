@@ -203,10 +203,10 @@ def test_near_the_force_itself_where_it_exceeds_a_newton(exported):
     wanted = source.answer(rows)
     large = np.abs(wanted) > 1.0
     assert np.mean(large) > 0.8
-    np.testing.assert_allclose(force(rows)[large], wanted[large], rtol=5e-6)
-    np.testing.assert_allclose(
-        wanted[large], by_hand(source.policy.network, rows)[large], rtol=5e-6
-    )
+    # Offset and gain times state, of a hundred newtons each, may leave one.
+    exact = by_hand(source.policy.network, rows)
+    np.testing.assert_allclose(force(rows)[large], wanted[large], rtol=4e-5)
+    np.testing.assert_allclose(wanted[large], exact[large], rtol=4e-5)
 
 
 @needs_onnx
