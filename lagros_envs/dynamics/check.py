@@ -14,7 +14,7 @@ import numpy as np
 from lagros_envs.arrays import FloatArray
 from lagros_envs.dynamics.straight_line import straight_line
 from lagros_envs.dynamics.system import System, components
-from lagros_envs.numbers import dual, exact, functions, variable
+from lagros_envs.numbers import TaylorModel, dual, exact, functions, monomials, variable
 from lagros_envs.numbers.series import KinkError
 
 _DRAWS = 16
@@ -207,7 +207,7 @@ def _check_affine(
 def _check_kinds(
     system: System, place: str, states: FloatArray, controls: FloatArray, rates: FloatArray
 ) -> None:
-    """Duals, intervals, series and recorded numbers."""
+    """Duals, intervals, series, Taylor models and recorded numbers."""
     n, m = system.state_dim, system.control_dim
     parts = components(states) + components(controls)
     seeds = dual.seed(parts)
@@ -219,6 +219,7 @@ def _check_kinds(
         "series (which give higher derivatives)": lambda: [
             variable(exact(part), 1) for part in parts
         ],
+        "Taylor models (which give tubes)": lambda: [_around(part) for part in parts],
     }
     for kind, numbers in kinds.items():
         given = numbers()
@@ -245,6 +246,14 @@ def _check_kinds(
         list(system.derivative(seeds[:n], seeds[n:], functions)), n + m, (len(states),)
     )
     _check_slopes(system, place, states, controls, slopes)
+
+
+def _around(places: FloatArray) -> TaylorModel:
+    """Return numbers that all move by one variable, a little."""
+    kept = monomials(1, 0, 0)
+    parts = np.zeros((kept.count, len(places)))
+    parts[0], parts[1] = places, _WIDTH
+    return TaylorModel(kept, parts, np.zeros(len(places)))
 
 
 def _middle(rate: Any) -> Any:

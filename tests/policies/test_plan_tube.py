@@ -4,16 +4,19 @@ import numpy as np
 import pytest
 
 from lagros_envs.dynamics import hold_step, linearise_hold
+from lagros_envs.task import Scenario
 from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.pvtol.physics import Pvtol
 from lagros_policies.contraction.feedback import riccati_gains
+from lagros_policies.expert import Expert
+from lagros_policies.learning.dataset import ExpertDataSettings, tube_states
 from lagros_policies.proof import hold_error, remainder
 from lagros_policies.proof.error_set import ErrorSet, boxed
 from lagros_policies.proof.hold_error import HoldOfErrors
 from lagros_policies.proof.plan_tube import curved, plan_tubes
 from lagros_policies.proof.steering import LinearGain, Steering
 from tests.policies.plan_flights import aimed, flown, hostile, in_ball, slopes
-from tests.policies.toys import Car, Puck
+from tests.policies.toys import Car, Puck, Slide
 
 PERIOD = 0.1
 LOOPS = {
@@ -323,6 +326,18 @@ def test_what_does_not_fit_is_refused():
         plan_tubes(system, PERIOD, np.nan * arrays[0], *arrays[1:], bound)
     with pytest.raises(ValueError, match="directions"):
         plan_tubes(system, PERIOD, *arrays, bound, directions=np.eye(3))
+
+
+def test_the_states_that_a_network_learns_from_lie_in_the_tube():
+    task, settings = Slide(), ExpertDataSettings(disturbance_bound=0.5, spread=0.0)
+    expert, rng = Expert(task), np.random.default_rng(13)
+    asked = Scenario(np.zeros(4), np.array([4.0, 0.5, 0.0, 0.0]))
+    plan = expert.planner.plan(asked.initial_state, asked.goal)
+    tracked = expert.track(np.stack([plan.states] * 40), np.stack([plan.controls] * 40))
+    found = tube(task.system, (plan.states, plan.controls), tracked.feedback[0], 0.5)
+    states, _, step = tube_states(rng, expert, tracked, settings)
+    share = np.abs(states - plan.states[step])[step > 5] / found.outputs[0, step[step > 5]]
+    assert 0.4 < share.max() <= 1.0
 
 
 @pytest.mark.slow
