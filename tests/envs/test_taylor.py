@@ -1,4 +1,4 @@
-"""Taylor models against dense sampling, against mpmath, and where nothing is known."""
+"""Taylor models against dense sampling, mpmath and flint, and where nothing is known."""
 
 import math
 
@@ -67,6 +67,58 @@ def test_coefficients_are_the_derivatives_that_mpmath_finds(name):
             slope = mpmath.diff(exact, (0, 0, 0), tuple(int(k) for k in exponent))
             expected = float(slope) / math.prod(map(math.factorial, exponent))
             assert part * 1e3 ** exponent.sum() == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+def random_formula(rng, numbers, depth=4):
+    """Return a random expression of numbers of any kind, whose denominators stay off zero."""
+    if depth == 0 or rng.random() < 0.1:
+        return numbers[rng.integers(len(numbers))]
+    one = random_formula(rng, numbers, depth - 1)
+    name = str(rng.choice(["add", "sub", "mul", "div", "sin", "cos", "exp", "sqrt", "tan", "cube"]))
+    if name in ("add", "sub", "mul", "div"):
+        two = random_formula(rng, numbers, depth - 1)
+        if name == "div":
+            return one / (2.5 + functions.sin(two))
+        return {"add": one + two, "sub": one - 0.5 * two, "mul": one * two}[name]
+    small = functions.sin(one)
+    return {
+        "sin": lambda: small,
+        "cos": lambda: functions.cos(one),
+        "exp": lambda: functions.exp(small),
+        "sqrt": lambda: functions.sqrt(1.5 + small),
+        "tan": lambda: functions.tan(0.7 * small),
+        "cube": lambda: one**3 - one / 3.0,
+    }[name]()
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_random_formulas_are_enclosed_by_what_flint_proves_of_them(seed):
+    flint = pytest.importorskip("flint")
+    rng = np.random.default_rng(seed)
+    kept, width = monomials(3, 0, 0), 0.125
+    places = rng.integers(-64, 65, (3, 1)) / 64.0
+    found = random_formula(np.random.default_rng(seed), numbers(kept, places, width))
+    before, flint.ctx.prec = flint.ctx.prec, 200
+    try:
+        for _ in range(40):
+            point = rng.normal(size=3)
+            point *= 0.999 / np.linalg.norm(point)
+            # Fractions of 2^20 are exact in both, and so are these products.
+            point = np.round(point * 2**20) / 2**20
+            exact = [
+                flint.arb(float(a)) + flint.arb(width) * float(b)
+                for a, b in zip(places[:, 0], point, strict=True)
+            ]
+            true = random_formula(np.random.default_rng(seed), exact)
+            polynomial = flint.arb(0)
+            for exponent, part in zip(kept.exponents.tolist(), found.parts[:, 0], strict=True):
+                term = flint.arb(float(part))
+                for power, one in zip(exponent, point, strict=True):
+                    term = term * flint.arb(float(one)) ** power
+                polynomial = polynomial + term
+            assert abs(true - polynomial) <= flint.arb(float(found.rest[0]))
+    finally:
+        flint.ctx.prec = before
 
 
 def test_rounding_is_in_the_rest():

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from lagros_envs.dynamics import hold_step, linearise_hold
+from lagros_envs.dynamics.integrate import rk4_hold
+from lagros_envs.numbers import functions
 from lagros_envs.task import Scenario
 from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.pvtol.physics import Pvtol
@@ -175,6 +177,43 @@ def one_hold(monkeypatch=None, wrong=None, size=0.15, seed=0, angle=0.5):
 def test_no_error_leaves_the_set_after_one_hold_of_a_wide_set():
     for seed in range(5):
         assert 0.5 < one_hold(seed=seed) <= 1.0
+
+
+def test_polynomials_of_a_hold_and_their_rest_enclose_what_flint_proves_of_the_step():
+    flint = pytest.importorskip("flint")
+    rng, system, n = np.random.default_rng(14), CartPole(), 4
+    state, control = np.array([[0.0, 0.5, 0.25, -0.5]]), np.array([[4.0]])
+    hold = HoldOfErrors(system, PERIOD, 0.5, np.ones(n, bool), np.arange(5) > 0)
+    errors, _ = wide_set(rng, n, 0.15)
+    gain = np.array([[[1.5, 22.0, 3.0, 5.0]]])
+    steering = Steering(gain, np.zeros((1, 1)), np.full((1, 1), 0.1))
+    domain = hold_error._Domain.around(errors, steering, hold.curved)
+    ended = hold._ended(domain, np.concatenate([state, control], axis=1))
+    kept = hold.monomials
+    before, flint.ctx.prec = flint.ctx.prec, 200
+    try:
+        for _ in range(20):
+            ball, push = rng.normal(size=(2, 4))
+            point = np.concatenate([ball, rng.uniform(-1.0, 1.0, 1), push])
+            point[:4] *= 0.999 / np.linalg.norm(ball)
+            point[5:] *= 0.999 / np.linalg.norm(push)
+            y = [flint.arb(float(one)) for one in point]
+            numbers = [flint.arb(float(state[0, 0])) + flint.arb(float(domain.width[0, 0])) * y[4]]
+            for row, place in zip(domain.scale[0], [*state[0, 1:], control[0, 0]], strict=True):
+                moved = sum(flint.arb(float(b)) * one for b, one in zip(row, y[:4], strict=True))
+                numbers.append(flint.arb(float(place)) + moved)
+            pushes = [flint.arb(hold.bound) * one for one in y[5:]]
+            true = rk4_hold(system, numbers[:4], numbers[4:], pushes, PERIOD, functions)
+            for value, model in zip(true, ended, strict=True):
+                total = flint.arb(0)
+                for exponent, part in zip(kept.exponents.tolist(), model.parts[:, 0], strict=True):
+                    term = flint.arb(float(part))
+                    for power, one in zip(exponent, y, strict=True):
+                        term = term * one**power
+                    total = total + term
+                assert abs(value - total) <= flint.arb(float(model.rest[0]))
+    finally:
+        flint.ctx.prec = before
 
 
 def test_a_wrong_sign_in_a_remainder_is_caught(monkeypatch):
