@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lagros_envs.aliases import moved_names
 from lagros_envs.dynamics import System
 from lagros_envs.numbers import Interval, exact
 from lagros_policies.contraction.held_design import HeldTube, bernstein_rate
@@ -15,8 +14,6 @@ from lagros_policies.proof.cells import Search, search
 from lagros_policies.proof.families import BoxCondition, Violation, lifted_matrices
 from lagros_policies.proof.matrices import matmul, negative_definite, transpose
 from lagros_policies.proof.sets import triples
-
-moved_names(__name__)
 
 # The shortest hold that is covered, as a share of the longest, where shorter ones are.
 SHORTEST = 1e-6

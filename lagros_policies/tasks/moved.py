@@ -61,7 +61,6 @@ NAMES = {
     "lagros_policies.contraction": {"Region": f"{_CARTPOLE}.region"},
     "lagros_policies.contraction.regions": {"Region": f"{_CARTPOLE}.region"},
     "lagros_policies.contraction.tube_design": {"PlanBox": f"{_CARTPOLE}.plans"},
-    "lagros_policies.contraction.held_ellipsoid": {"held_statement": f"{_CARTPOLE}.certificate"},
     "lagros_policies.contraction.theorems": {
         "lipschitz_constant": f"{_CARTPOLE}.lipschitz",
         "Lipschitz": f"{_CARTPOLE}.lipschitz",

@@ -82,11 +82,13 @@ def linear_loop(task, weights, count=3, flown=1.0, shrunk=1.0):
 
 
 CARTPOLE = ((3.0, 1.0, 1.0, 1.0), 0.03)
+# Short, so that its tubes take little.
+SHORT = CartPoleSettings(time_limit=4.0)
 
 
 @pytest.fixture(scope="module")
 def cartpole_evidence():
-    loop = linear_loop(CartPoleSettings(), CARTPOLE)
+    loop = linear_loop(SHORT, CARTPOLE)
     return loop, evidence_of(loop, 0.1, KINDS, QUICK)
 
 
@@ -96,13 +98,13 @@ def test_the_cartpole_is_guaranteed_and_a_search_comes_near_the_bound(cartpole_e
     assert found.contradicted == 0
     assert np.all(found.shares <= 1.0)
     assert np.all(found.shares >= 0.66)
-    line = words.headline(CartPoleSettings(), loop, found, 0.1)
+    line = words.headline(SHORT, loop, found, 0.1)
     assert line.startswith(
         "guaranteed for 3 of 3 episodes at d̄ = 0.1: reaches the goal, |theta| ≤ "
     )
     assert "rad, whatever the disturbance does; the search came to" in line
-    assert [one.holds for one in words.proved_lines(CartPoleSettings(), loop, found)] == [True] * 2
-    record = guaranteed.as_json(found, CartPoleSettings())
+    assert [one.holds for one in words.proved_lines(SHORT, loop, found)] == [True] * 2
+    record = guaranteed.as_json(found, SHORT)
     json.dumps(record, allow_nan=False)
     assert record["share"] == 1.0
     bounds = record["state_bounds"]
@@ -115,18 +117,18 @@ def test_the_cartpole_is_guaranteed_and_a_search_comes_near_the_bound(cartpole_e
 @pytest.mark.parametrize("flown", [-1.0, 0.4, 2.5])
 def test_a_planted_wrong_gain_is_refuted(flown):
     """The tubes are of one gain, another flies: the search finds it out, whatever is proved."""
-    loop = linear_loop(CartPoleSettings(), CARTPOLE, flown=flown)
+    loop = linear_loop(SHORT, CARTPOLE, flown=flown)
     found = evidence_of(loop, 0.1, (), QUICK)
     assert found.contradicted > 0
-    assert words.headline(CartPoleSettings(), loop, found, 0.1).startswith("CONTRADICTED in ")
+    assert words.headline(SHORT, loop, found, 0.1).startswith("CONTRADICTED in ")
     assert not words.search_line(found).holds
 
 
 def test_a_tube_that_is_a_tenth_too_small_is_crossed():
-    loop = linear_loop(CartPoleSettings(), CARTPOLE, count=2, shrunk=0.9)
+    loop = linear_loop(SHORT, CARTPOLE, count=2, shrunk=0.9)
     found = evidence_of(loop, 0.02, (), QUICK)
     assert found.contradicted == 2
-    assert guaranteed.as_json(found, CartPoleSettings())["search"]["contradicted"] == 2
+    assert guaranteed.as_json(found, SHORT)["search"]["contradicted"] == 2
 
 
 @pytest.mark.parametrize(
@@ -147,7 +149,7 @@ def test_flights_among_discs_never_contradict_what_is_guaranteed(task, weights, 
 
 
 def test_nothing_is_guaranteed_where_no_tube_closes():
-    task = CartPoleSettings()
+    task = SHORT
     loop = linear_loop(task, CARTPOLE, count=2)
     found = evidence_of(loop, 3.0, (), replace(QUICK, budget=10))
     assert found.count == 0
@@ -160,9 +162,42 @@ def test_nothing_is_guaranteed_where_no_tube_closes():
     assert record["not_shown"] == {"tube": 2}
 
 
+@pytest.mark.parametrize("policy", ["tube-mpc", "tube-mpc:half-rate", "lqr-plan"])
+def test_every_law_that_is_a_gain_along_a_plan_is_spoken_of(policy):
+    loop = loop_named(policy, SHORT, episode_seeds(6, 2, 98765))
+    found = evidence_of(loop, 0.02, KINDS, QUICK)
+    assert found.count == 2
+    assert found.contradicted == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("policy", "task", "bound"),
+    [
+        ("tube-mpc", "cartpole", 0.1),
+        ("tube-mpc", "cartpole", 0.25),
+        ("tube-mpc", "pvtol", 0.05),
+        ("tube-mpc", "examples/car.py", 0.1),
+        ("lagros", "cartpole", 0.001),
+        ("lagros", "cartpole", 0.05),
+    ],
+)
+def test_no_search_contradicts_what_is_guaranteed_of_the_shipped_loops(policy, task, bound):
+    loop = loop_named(policy, find_task(task), episode_seeds(7, 10, 98765))
+    found = evidence_of(loop, bound, ("uniform", "sphere", "constant", "gust"))
+    assert found.contradicted == 0
+
+
+@pytest.mark.parametrize("policy", ["tube-mpc:projected", "tube-mpc:least-norm", "tube-mpc:tuned"])
+def test_no_statement_is_about_a_law_that_is_no_gain(policy):
+    loop = loop_named(policy, SHORT, episode_seeds(6, 1, 98765))
+    assert loop.tubes is None
+    assert policy in loop.why
+
+
 @pytest.mark.parametrize("policy", ["lqr", "learned", "random", "ppo"])
 def test_no_statement_is_about_a_policy_of_another_loop(policy):
-    task = CartPoleSettings()
+    task = find_task("cartpole")
     loop = loop_named(policy, task, episode_seeds(4, 1, 98765))
     assert loop.tubes is None
     assert policy in loop.why

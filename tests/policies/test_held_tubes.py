@@ -1,6 +1,5 @@
 """The tube of a held control: its program, its proof, and flights that try to leave it."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -18,16 +17,8 @@ from lagros_policies.contraction.held_ellipsoid import (
     _falls_at_instants,
     prove_held_tube,
 )
-from lagros_policies.contraction.statement import at_most
 from lagros_policies.proof.cells import Search
-from lagros_policies.tasks.cartpole.box import ProofBox
-from lagros_policies.tasks.cartpole.certificate import (
-    CartPoleQuestion,
-    cartpole_certificate,
-    held_statement,
-)
 from lagros_policies.tasks.cartpole.plans import PlanBox
-from tests.policies.shipped import shipped_metric
 
 PLAN = PlanBox(angle=0.05, velocity=0.3, angular_rate=0.1, force=0.3)
 BOUND, PERIOD = 0.1, 0.1
@@ -41,13 +32,9 @@ def tube(request, system):
     return design_held_contained(system, PLAN, design)
 
 
-def test_it_is_proved_and_says_so(system, tube):
+def test_it_is_proved(system, tube):
     proof = prove_held_tube(system, tube, 60.0)
     assert proof.proved
-    line = held_statement(tube, proof)
-    assert line.holds
-    assert line.kind == "proved"
-    assert f"{at_most(tube.steady_outputs[1])} rad" in line.text
     # Worth having: below ten times the disturbance, in spite of the hold.
     assert tube.steady_radius < 10 * BOUND
 
@@ -236,27 +223,3 @@ def test_a_disturbance_without_a_contained_tube_is_refused(system):
 def test_values_out_of_range_are_refused(change, match):
     with pytest.raises(ValueError, match=match):
         HeldDesign(**change)
-
-
-@pytest.mark.parametrize("tube", [False], indirect=True, ids=["periodic"])
-def test_a_certificate_carries_the_tube_and_an_outsider_finds_it_kept(system, tube, oracle):
-    question = CartPoleQuestion(ProofBox(0.06, 0.3, 0.3, 0.3), BOUND, 0.0, 3.15)
-    found = cartpole_certificate(system, shipped_metric(), question, proofs=[], held=[tube])
-    assert found.holds
-    record = json.loads(json.dumps(found.as_json(), allow_nan=False))["held_tubes"][0]
-    coefficients, gain = np.array(record["Q"]), np.array(record["K"])
-    polynomial = BPoly(coefficients[:, None], [0.0, record["hold"]])
-    state = np.zeros((1, 4))
-    for _ in range(30):
-        force = state @ gain.T
-        for part in range(10):
-            time = record["hold"] * part / 10
-            pull = np.concatenate([state, force], axis=1) @ np.linalg.inv(polynomial(time)) + 1e-9
-            push = pull[:, :4] / np.linalg.norm(pull[:, :4])
-            state = oracle.step(state, force, record["hold"] / 10, 1, record["d_bar"] * push)
-            assert np.all(np.abs(state[0]) <= list(record["outputs"].values()))
-    assert np.abs(state[0, 1]) > 0.05 * record["outputs"]["theta"]
-    spoiled = replace(tube, duals=0.8 * tube.duals)
-    assert not cartpole_certificate(
-        system, shipped_metric(), question, proofs=[], held=[spoiled]
-    ).holds

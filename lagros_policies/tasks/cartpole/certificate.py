@@ -1,30 +1,24 @@
 """The cart-pole's certificate: what is proved of a metric on a box, and which tubes follow.
 
 Theorem 1 holds while the state stays in the box on which the condition was proved; it does not say
-that it stays there. So there are two kinds of tube here: the paper's, conditional on that, and
-those of `tube_design` and, for a control that is held, of `held_design`, which keep the state in
-their box by themselves.
+that it stays there, and it is of a control that answers at every instant.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lagros_envs.tasks.cartpole.physics import ANGLE, ANGULAR_RATE, VELOCITY, CartPole
 from lagros_policies.contraction.certificate import Certificate, Stopwatch, TubeSizes
 from lagros_policies.contraction.condition import Samples
-from lagros_policies.contraction.ellipsoid import prove_tube
-from lagros_policies.contraction.held_design import HeldTube
-from lagros_policies.contraction.held_ellipsoid import SHORTEST, HeldTubeProof, prove_held_tube
 from lagros_policies.contraction.metric import Metric
 from lagros_policies.contraction.statement import Statement, at_most
 from lagros_policies.contraction.theorems import disturbed_rate, feasibility_residual
 from lagros_policies.contraction.tube import Tube, diverging_bound
-from lagros_policies.contraction.tube_design import ConstantTube
 from lagros_policies.proof.bounds import ProvedBounds, metric_drift, prove_bounds
 from lagros_policies.proof.condition import prove_contraction
 from lagros_policies.tasks.cartpole.box import ProofBox
@@ -49,8 +43,6 @@ class CartPoleQuestion:
         paper_radius: What the published tube tends to.
         policy: Whose learning error that is.
         most_seconds: Time for each search for a proof [s].
-        control_error: Distance from a control that contracts in *this* metric, which is what
-            Theorem 1 takes for eps_l [N]; None if the network imitates the u* of this metric.
     """
 
     box: ProofBox
@@ -59,12 +51,6 @@ class CartPoleQuestion:
     paper_radius: float
     policy: str = "lagros"
     most_seconds: float = 60.0
-    control_error: float | None = None
-
-    @property
-    def error(self) -> float:
-        """What Theorem 1 takes for eps_l [N]."""
-        return self.learning_error if self.control_error is None else self.control_error
 
 
 def cartpole_certificate(
@@ -72,8 +58,6 @@ def cartpole_certificate(
     metric: Metric,
     question: CartPoleQuestion,
     proofs: Sequence[Statement] | None = None,
-    tubes: Sequence[ConstantTube] = (),
-    held: Sequence[HeldTube] = (),
 ) -> Certificate:
     """Prove what can be proved of a metric and return it as a certificate.
 
@@ -85,8 +69,6 @@ def cartpole_certificate(
         question: What is asked.
         proofs: Statements of what was proved, first of all (14) on the box; proved here if None,
             and taken as proved elsewhere if there are none.
-        tubes: Tubes of constant metrics to prove as well.
-        held: Tubes of a held control, likewise.
 
     Raises:
         TypeError: The system is no cart-pole, or the metric no polynomial.
@@ -139,7 +121,7 @@ def cartpole_certificate(
         rate if rate > 0.0 else alpha,
         bounds.condition,
         question.disturbance_bound,
-        question.error,
+        question.learning_error,
         bounds.control_gain,
     )
     radius = tube.steady_radius * (1.0 + _ROUNDING)
@@ -149,12 +131,6 @@ def cartpole_certificate(
     lines.extend(_theorem_two(system, metric, box))
     lemma, lipschitz = _lemma(system, question, bounds)
     lines.append(lemma)
-    for constant in tubes:
-        proof = prove_tube(system, constant, question.most_seconds)
-        lines.append(tube_statement(constant, proof.proved, proof.seconds))
-    lines.extend(
-        held_statement(tube, prove_held_tube(system, tube, question.most_seconds)) for tube in held
-    )
     return replace(
         certificate,
         chi=bounds.condition,
@@ -168,10 +144,7 @@ def cartpole_certificate(
             "drift": drift,
             "disturbed_rate": rate,
             "lipschitz": lipschitz,
-            "control_error": question.control_error,
             "largest_disturbance_of_the_angle": 2.0 * alpha / drift if drift > 0.0 else None,
-            "tubes": [tube_record(constant) for constant in tubes],
-            "held_tubes": [held_record(tube) for tube in held],
         },
     )
 
@@ -197,83 +170,6 @@ def basis_of(metric: Metric) -> str:
     if metric.degree == 0:
         return "1 (W_bar is constant); the state is [p, theta, p_dot, theta_dot]"
     return "cos(theta)^i; the state is [p, theta, p_dot, theta_dot]"
-
-
-def tube_record(tube: ConstantTube) -> dict[str, object]:
-    """Return a tube of a constant metric as what JSON can hold."""
-    return {
-        "method": tube.design.method,
-        **_record(tube),
-        "largest_d_bar": tube.largest_bound,
-        "nu": tube.control_weight,
-        "W": tube.dual.tolist(),
-    }
-
-
-def held_record(tube: HeldTube) -> dict[str, object]:
-    """Return a tube of a held control as what JSON can hold; `Q` are Bernstein's coefficients."""
-    return {
-        **_record(tube),
-        "hold": tube.design.period,
-        "shorter_holds_too": tube.design.aperiodic,
-        "deviation": tube.largest_deviation,
-        "K": tube.gain.tolist(),
-        "Q": tube.duals.tolist(),
-    }
-
-
-def _record(tube: ConstantTube | HeldTube) -> dict[str, object]:
-    design, names = tube.design, ("p", "theta", "p_dot", "theta_dot")
-    return {
-        "output": None if design.output is None else list(design.output),
-        "alpha": design.rate,
-        "d_bar": design.disturbance_bound,
-        "radius": tube.steady_radius,
-        "outputs": dict(zip(names, tube.steady_outputs.tolist(), strict=True)),
-        "contained": tube.contained,
-        "plan": asdict(tube.plan),
-        "region": {name: list(ends) for name, ends in region_of(tube.proof_box).items()},
-    }
-
-
-def tube_statement(tube: ConstantTube, proved: bool, seconds: float) -> Statement:
-    """Return a tube of a constant metric as a line of a certificate."""
-    text = (
-        f"{tube.design.method} tube, all disturbances up to {tube.design.disturbance_bound:g}, "
-        f"control at will, e(0) = 0: {_widths(tube)}; it keeps the state in its box while "
-        f"{_where(tube)}"
-    )
-    return Statement(text, "proved", proved, seconds)
-
-
-def held_statement(tube: HeldTube, proof: HeldTubeProof) -> Statement:
-    """Return a tube of a held control as a line of a certificate."""
-    design = tube.design
-    holds = f"holds of {SHORTEST * design.period:g} to" if design.aperiodic else "held"
-    text = (
-        f"ellipsoid tube, control {holds} {design.period:g} s, at the instants and between them, "
-        f"all disturbances up to {design.disturbance_bound:g}, e(0) = 0: {_widths(tube)}, "
-        f"|u - u_d| <= {at_most(tube.largest_deviation)} N for u = u_d + K e, K = "
-        f"{np.round(tube.gain[0], 3).tolist()} (rounded); it keeps the state in its box while "
-        f"{_where(tube)}"
-    )
-    return Statement(text, "proved", proof.proved, proof.seconds)
-
-
-def _widths(tube: ConstantTube | HeldTube) -> str:
-    p, angle = tube.steady_outputs[[0, ANGLE]]
-    return (
-        f"|theta - theta_d| <= {at_most(angle)} rad, |p - p_d| <= {at_most(p)} m, ||e|| <= "
-        f"{at_most(tube.steady_radius)}"
-    )
-
-
-def _where(tube: ConstantTube | HeldTube) -> str:
-    plan = tube.plan
-    return (
-        f"|theta_d| <= {plan.angle:g} rad, |p_d'| <= {plan.velocity:g} m/s, |theta_d'| <= "
-        f"{plan.angular_rate:g} rad/s and |u_d| <= {plan.force:g} N"
-    )
 
 
 def _contraction(
@@ -306,14 +202,11 @@ def _theorem_one(
             f"disturbances up to {bound:g} of the two rates only (of all four states "
             f"d_bar < {2.0 * alpha / drift:.3g} would be needed: kappa = {at_most(drift)})"
         )
-    known = ""
-    if question.control_error is None and question.learning_error > 0.0:
-        known = " (how far it is from that was not flown; taken is the recorded ||u_L - u*||)"
     return (
         f"Theorem 1, control at will, e(0) = 0, while x stays in the region: ||e(t)|| <= "
         f"{at_most(tube.steady_radius)} (1 - exp(-{at_most(tube.contraction_rate)} t)) for {what}, "
-        f"and a control within {at_most(question.error)} N of one that contracts in this metric"
-        f"{known}"
+        f"and a control within {at_most(question.learning_error)} N of one that contracts in this "
+        "metric"
     )
 
 
