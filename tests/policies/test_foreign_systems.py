@@ -493,6 +493,7 @@ GENERAL = {
     ),
     *(
         "contraction.control.HeldControl",
+        "contraction.control.contracting_set",
         "contraction.cvstem.design_metric",
         "contraction.cvstem.design_on_pool",
         "contraction.cvstem.search_rate",
@@ -504,6 +505,8 @@ GENERAL = {
         f"proof.families.{name}"
         for name in ("rate_matrices", "hold_matrices", "lifted_matrices", "held_ends")
     ),
+    *("proof.guarantee.nominal_between", "proof.plan_tube.plan_tubes", "proof.plan_tube.curved"),
+    *("proof.between.holds", "proof.between.errors_between", "proof.hold_error.HoldOfErrors"),
     *("contraction.ellipsoid.TubeControl", "tasks.cartpole.box.balance"),
     *(
         "remarks.stochastic.noisy_hold_step",
