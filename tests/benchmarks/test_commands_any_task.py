@@ -161,6 +161,16 @@ def test_the_quadrotor_and_the_car_are_served_alike(task: Any, invoke: Any) -> N
     assert row["outcomes"][0]["measures"]["left_paper_tube"] is None
 
 
+def test_flights_of_a_task_without_a_metric_are_guaranteed(invoke: Any) -> None:
+    result = invoke("certify", FILE, "--bound", 0.01, "--episodes", 2, "--json", "c.json")
+    assert result.exit_code == 0, result.output
+    line = result.stdout.splitlines()[0]
+    assert line.startswith("guaranteed for 2 of 2 episodes at d̄ = 0.01: reaches the goal, touches")
+    found = json.loads(Path("c.json").read_text())
+    assert found["guarantee"]["guaranteed"] == 2
+    assert found["guarantee"]["search"]["contradicted"] == 0
+
+
 # With a metric
 
 

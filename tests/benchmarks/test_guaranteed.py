@@ -109,6 +109,9 @@ def test_the_cartpole_is_guaranteed_and_a_search_comes_near_the_bound(cartpole_e
     assert record["share"] == 1.0
     bounds = record["state_bounds"]
     assert list(bounds) == ["p", "theta", "dp/dt", "dtheta/dt"]
+    shares = list(record["search"]["shares_of_bounds"].values())
+    assert len(shares) == 4
+    assert 0.5 < min(shares) <= max(shares) <= 1.0
     # What flew is below what is proved, and above what the plans do by themselves.
     theta = np.abs(loop.episodes.plans[..., 1]).max()
     assert theta < bounds["theta"] < math.pi / 2
@@ -317,6 +320,26 @@ def test_the_columns_stand_in_every_table_and_nowhere_when_not_asked():
         "proved\n%",
         "bound\n/worst",
     ]
+
+
+def test_flights_of_a_benchmark_keep_what_is_guaranteed_of_them():
+    settings = BenchmarkSettings(
+        policies=("tube-mpc", "lqr"),
+        episodes=2,
+        disturbances=("constant", "sphere"),
+        bounds=(0.05,),
+        guarantee=True,
+    )
+    run = run_benchmark(settings)
+    for row in summarise(run):
+        if row["policy"] == "lqr":
+            assert row["guaranteed_rate"] is None
+            continue
+        assert row["guaranteed_rate"] == 1.0
+        assert row["guarantees_contradicted"] == 0
+        assert row["bound_over_worst"] >= 1.0
+        # Larger than the bound of the linear error would be no use.
+        assert row["bound_over_worst"] < 20.0
 
 
 @pytest.mark.usefixtures("faked")

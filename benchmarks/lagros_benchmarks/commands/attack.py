@@ -179,8 +179,8 @@ def summary(row: dict[str, Any]) -> list[str]:
         f"(random: worst {row['random_score_worst']:.4g})",
     ]
     if row.get("max_tracking_error_max") is not None:
-        largest = row["max_tracking_error_max"]
-        lines.append(f"observed tube {largest:.3g}, {largest / row['bound']:.3g} per unit of d̄")
+        each = row["max_tracking_error_per_bound"]
+        lines.append(f"observed tube {row['max_tracking_error_max']:.3g}, {each:.3g} per unit of d̄")
         if row.get("in_region_rate") is not None:
             left = round((1.0 - row["in_region_rate"]) * count)
             lines[-1] += f"; {left} of {count} flights left the region of the metric"

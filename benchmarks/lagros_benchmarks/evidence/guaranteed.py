@@ -233,10 +233,24 @@ def as_json(evidence: Evidence, task: Task) -> dict[str, Any] | None:
             }
             if some
             else None,
+            # Of each coordinate at the control instants, over its own bound.
+            "shares_of_bounds": dict(zip(names, _coordinate_shares(evidence).tolist(), strict=True))
+            if some
+            else None,
             "contradicted": evidence.contradicted,
             "seconds": round(evidence.search_seconds, 3),
         },
     }
+
+
+def _coordinate_shares(evidence: Evidence) -> FloatArray:
+    """Return the largest errors found over their bounds, medians of guaranteed episodes, (n,)."""
+    assert evidence.proved is not None
+    assert evidence.tubes is not None
+    found = evidence.worst.outputs
+    bounds = evidence.tubes.outputs[..., : found.shape[1]].max(axis=1)
+    kept = evidence.proved.holds
+    return np.asarray(np.median(found[kept] / bounds[kept], axis=0))
 
 
 def not_shown(evidence: Evidence) -> dict[str, int]:

@@ -129,6 +129,9 @@ def run_attack(settings: AttackSettings, progress: Progress | None = None) -> At
     check_bound(pushes, settings.bound)
     outcomes, baseline = bench.replay(pushes), bench.replay(bench.random(_BASELINE))
     row = {**_row(settings, outcomes, baseline, found, seconds), **bench.figures()}
+    largest = row.get("max_tracking_error_max")
+    if largest is not None:
+        row["max_tracking_error_per_bound"] = largest / settings.bound
     return Attack(row, WorstCases(asdict(settings), pushes, tuple(outcomes)))
 
 
