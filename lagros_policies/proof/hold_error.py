@@ -27,6 +27,7 @@ from lagros_policies.proof.error_set import ROUNDING, WIDER, ErrorSet
 from lagros_policies.proof.remainder import (
     cubic_forms,
     cubic_lines,
+    narrower_range,
     quadratic_forms,
     quadratic_range,
 )
@@ -36,6 +37,8 @@ from lagros_policies.proof.steering import Steering
 _THIN = 1e-9
 # How much wider the ellipsoid is than what floats make of it.
 _ROOM = 1e-8
+# Directions of the remainder, the largest, whose quadratic forms are looked at more closely.
+_CLOSER = 2
 # An error beyond this is not followed: its square would soon be no number.
 _LOST = 1e30
 
@@ -91,10 +94,10 @@ class HoldOfErrors:
         ended = self._ended(domain, place)
         parts = np.moveaxis(np.stack([one.parts for one in ended]), -1, 0)
         rest = np.stack([one.rest for one in ended], axis=-1)
-        known = np.isfinite(parts).all(axis=(1, 2)) & np.isfinite(rest).all(axis=1)
+        known = domain.known & np.isfinite(parts).all(axis=(1, 2)) & np.isfinite(rest).all(axis=1)
         parts = np.where(known[:, None, None], parts, 0.0)
         rest = np.where(known[:, None], rest, 0.0)
-        basis, middle, lines, radius = _remainder(kept, parts)
+        basis, middle, lines, radius = _remainder(kept, parts, domain.blocks(errors, steering))
         by_curved = parts[:, :, kept.first[0]] + basis @ lines
         matrix, lost = domain.slopes(by_curved, parts[:, :, kept.first[1]])
         slope = matrix @ domain.rows
@@ -149,12 +152,14 @@ class _Domain:
         rows: From e - c to states and controls, shape (p, n + m, n); controls have noise besides.
         width: Bounds of these, shape (p, n + m).
         scale: B, shape (p, r, r).
+        known: Where there is an ellipsoid, shape (p,); elsewhere B is the identity.
         curved: As in `HoldOfErrors`.
     """
 
     rows: FloatArray
     width: FloatArray
     scale: FloatArray
+    known: BoolArray
     curved: BoolArray
 
     @classmethod
@@ -178,10 +183,26 @@ class _Domain:
         share = ROUNDING * _times(np.abs(some), errors.spread).max(axis=1)
         room = _ROOM + share * share / _ROOM
         shape = shape * (1.0 + _ROOM) + room[:, None, None] * np.eye(shape.shape[1])
-        finite = np.isfinite(shape).all(axis=(1, 2))[:, None, None]
-        shape = np.where(finite, shape, np.eye(shape.shape[1]))
-        scale = width[:, curved, None] * np.linalg.cholesky(shape)
-        return cls(rows, width, np.where(finite, scale, np.inf), curved)
+        known = np.asarray(np.isfinite(shape).all(axis=(1, 2)))
+        scale = width[:, curved, None] * np.linalg.cholesky(
+            np.where(known[:, None, None], shape, np.eye(shape.shape[1]))
+        )
+        scale = np.where(known[:, None, None], scale, np.eye(shape.shape[1]))
+        return cls(rows, width, scale, known, curved)
+
+    def blocks(self, errors: ErrorSet, steering: Steering) -> FloatArray:
+        """Return G_j G_j' of the balls and segments whose sum y lies in, shape (p, j, r, r)."""
+        plans, n = errors.centre.shape
+        noise = np.zeros((plans, self.rows.shape[1], steering.gain.shape[1]))
+        noise[:, n:] = steering.radius[:, :, None] * np.eye(steering.gain.shape[1])
+        columns = np.concatenate([self.rows @ errors.generators, noise], axis=2)
+        columns = np.where(self.known[:, None, None], columns[:, self.curved], 0.0)
+        columns = np.linalg.solve(self.scale, columns)
+        count, width = errors.balls.shape[2:]
+        balls = columns[:, :, : count * width].reshape(plans, columns.shape[1], count, width)
+        balls = np.moveaxis(balls, 2, 1)
+        thin = np.moveaxis(columns[:, :, count * width :], 2, 1)[..., None]
+        return np.concatenate([balls @ _transposed(balls), thin @ _transposed(thin)], axis=1)
 
     def slopes(self, by_curved: FloatArray, by_lone: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return slopes by states and controls, from those by y and by the other coordinates.
@@ -193,12 +214,11 @@ class _Domain:
         Returns:
             Shape (p, n, n + m), and what floats lose of L y, shape (p, n).
         """
-        scale = np.where(np.isfinite(self.scale), self.scale, 0.0) + np.where(
-            np.isfinite(self.scale), 0.0, np.eye(self.scale.shape[1])
+        found: FloatArray = _transposed(
+            np.linalg.solve(_transposed(self.scale), _transposed(by_curved))
         )
-        found: FloatArray = _transposed(np.linalg.solve(_transposed(scale), _transposed(by_curved)))
-        defect = np.abs(by_curved - found @ scale)
-        defect += ROUNDING * (np.abs(by_curved) + np.abs(found) @ np.abs(scale))
+        defect = np.abs(by_curved - found @ self.scale)
+        defect += ROUNDING * (np.abs(by_curved) + np.abs(found) @ np.abs(self.scale))
         matrix = np.zeros((*by_curved.shape[:2], self.rows.shape[1]))
         matrix[:, :, self.curved] = found
         matrix[:, :, ~self.curved] = by_lone / self.width[:, None, ~self.curved]
@@ -207,7 +227,7 @@ class _Domain:
 
 
 def _remainder(
-    kept: Monomials, parts: FloatArray
+    kept: Monomials, parts: FloatArray, blocks: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Enclose what is quadratic and cubic in polynomials (p, n, count).
 
@@ -220,6 +240,10 @@ def _remainder(
     turned = _transposed(basis) @ parts
     forms = quadratic_forms(turned[:, :, places[0]], kept.members[places[0]], kept.variables)
     middle, radius = quadratic_range(forms)
+    most = slice(-_CLOSER, None)
+    middle[:, most], radius[:, most] = narrower_range(
+        forms[:, most], middle[:, most], radius[:, most], blocks
+    )
     forms = cubic_forms(turned[:, :, places[1]], kept.members[places[1]], kept.variables)
     lines, left = cubic_lines(forms)
     mixed = np.sqrt((turned[:, :, places[2]] ** 2).sum(axis=-1))

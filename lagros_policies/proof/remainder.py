@@ -16,6 +16,10 @@ from lagros_policies.proof.error_set import WIDER
 
 # Eigenvalues, rotations and sums of a few hundred products, relative to the norm of a form.
 _ROUNDING = 1e-12
+# Room for the rounding of a sum of balls, which the ellipsoid of a domain has as well.
+_ROOM = 1e-8
+# Ellipsoids that are turned one after the other.
+_PASSES = 3
 # Slices of the ball along one coordinate, and halvings of the slope of the line.
 _SLICES = 48
 _HALVINGS = 7
@@ -54,6 +58,47 @@ def quadratic_range(forms: FloatArray) -> tuple[FloatArray, FloatArray]:
     low = np.minimum(values[..., 0], 0.0) - slack
     high = np.maximum(values[..., -1], 0.0) + slack
     return 0.5 * (low + high), 0.5 * (high - low) * WIDER
+
+
+def narrower_range(
+    forms: FloatArray, middle: FloatArray, radius: FloatArray, blocks: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Enclose y'H y over a sum of balls and segments inside ||y|| <= 1 more closely.
+
+    Around the sum lie many ellipsoids {y: |l'y|^2 <= l'P l}, P = (sum_j w_j) sum_j G_j G_j' / w_j;
+    for each end of the range one is turned to where the form is largest in the last one.
+
+    Args:
+        forms: H, symmetric, shape (p, k, r, r).
+        middle: Of the range over the ball, shape (p, k).
+        radius: Likewise.
+        blocks: G_j G_j' of each ball and segment, shape (p, j, r, r).
+
+    Returns:
+        Middle and radius of the range, each (p, k).
+    """
+    plans, count, size, _ = blocks.shape
+    flat = blocks.reshape(plans, count, -1)
+    slack = _ROOM * np.sqrt((forms * forms).sum(axis=(-1, -2)))
+    ends = []
+    for side, known in ((forms, middle + radius), (-forms, radius - middle)):
+        lengths = np.trace(blocks, axis1=-2, axis2=-1)[:, None]
+        for _ in range(_PASSES):
+            weights = np.sqrt(np.maximum(lengths, 0.0))
+            weights = weights + (1e-2 / count) * weights.sum(axis=-1, keepdims=True) + 1e-100
+            shape = (1.0 / weights) @ flat * weights.sum(axis=-1, keepdims=True)
+            shape = shape.reshape(plans, -1, size, size) + _ROOM * np.eye(size)
+            root = np.linalg.cholesky(shape)
+            values, vectors = np.linalg.eigh(np.swapaxes(root, -1, -2) @ side @ root)
+            spread = 1.0 + np.trace(shape, axis1=-2, axis2=-1)
+            known = np.minimum(known, np.maximum(values[..., -1], 0.0) + slack * spread)
+            # The longest y is supported along P^-1 y.
+            along = np.linalg.solve(np.swapaxes(root, -1, -2), vectors[..., -1:])
+            pairs = (along * np.swapaxes(along, -1, -2)).reshape(plans, -1, size * size)
+            lengths = pairs @ np.swapaxes(flat, -1, -2)
+        ends.append(known)
+    high, low = ends
+    return 0.5 * (high - low), 0.5 * (high + low) * WIDER
 
 
 def cubic_lines(forms: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -335,6 +335,39 @@ def test_forms_over_the_ball_are_enclosed(size):
     assert np.all(off <= left)
 
 
+def test_forms_over_a_sum_inside_the_ball_are_enclosed_more_closely():
+    rng = np.random.default_rng(15)
+    balls, segments = rng.normal(size=(1, 4, 5, 4)), rng.normal(size=(1, 4, 6))
+    scale = np.linalg.cholesky(ErrorSet.ellipsoid(balls, segments)[0] * (1.0 + 1e-9))
+    balls = np.linalg.solve(scale, balls.reshape(1, 4, -1)).reshape(balls.shape)
+    segments = np.linalg.solve(scale, segments)
+    found = ErrorSet(np.zeros((1, 4)), balls, segments)
+    blocks = np.concatenate(
+        [
+            np.einsum("piju,pkju->pjik", balls, balls),
+            np.einsum("pij,pkj->pjik", segments, segments),
+        ],
+        axis=1,
+    )
+    square = rng.normal(size=(1, 30, 4, 4))
+    square = square + np.swapaxes(square, 2, 3)
+    wide = remainder.quadratic_range(square)
+    middle, radius = remainder.narrower_range(square, *wide, blocks)
+    directions = rng.normal(size=(40_000, 4))
+    pulls = np.einsum("di,ijq->djq", directions, balls[0])
+    pulls /= np.linalg.norm(pulls, axis=-1, keepdims=True)
+    members = np.einsum("ijq,djq->di", balls[0], pulls)
+    members += np.sign(directions @ segments[0]) @ segments[0].T
+    assert np.all(members @ directions[0] <= found.support(directions[None, :1])[0])
+    values = np.einsum("di,kij,dj->kd", members, square[0], members)
+    values = np.concatenate([values, np.zeros((30, 1))], axis=1)
+    assert np.all(np.abs(values - middle[0, :, None]).max(axis=1) <= radius[0])
+    reached = 0.5 * (values.max(axis=1) - values.min(axis=1))
+    # Nearer to what is reached than the ball.
+    assert np.all(radius <= wide[1] * (1.0 + 1e-9))
+    assert np.median(radius[0] / reached) < 0.93 * np.median(wide[1][0] / reached)
+
+
 def test_a_cube_follows_three_quarters_of_a_line():
     cube = np.zeros((1, 2, 2, 2))
     cube[0, 0, 0, 0] = 1.0
