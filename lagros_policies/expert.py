@@ -163,6 +163,7 @@ class Expert:
         metric: The contraction metric of the task; its own if left out.
         preference: What "tuned" prefers; the task's if left out.
         law: One of `LAWS`; if left out, "tuned" with a preference and the shipped one without.
+        weights: Of a law along a plan; if left out, what it makes of those of the task.
 
     Raises:
         FileNotFoundError: The law needs the task's metric, which has not been made.
@@ -176,6 +177,7 @@ class Expert:
         metric: ContractionMetric | None = None,
         preference: Preference | None = None,
         law: str | None = None,
+        weights: Feedback | None = None,
     ) -> None:
         self.task = task
         self.law_name = law or (SHIPPED_LAW if preference is None else "tuned")
@@ -189,7 +191,9 @@ class Expert:
         self._metric, self._preference = metric, preference
         self.planner = planner_of(task)
         along = _ALONG.get(self.law_name)
-        self._weights = None if along is None else along(task)
+        if weights is not None and along is None:
+            raise ValueError(f"law={self.law_name!r} has no weights: leave them out, or law")
+        self._weights = weights if along is None or weights is not None else along(task)
         bounds = np.array([task.control_low, task.control_high], np.float64)
         self._bounds = None if np.all(np.isinf(bounds)) else bounds
         if self._weights is None:

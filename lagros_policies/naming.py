@@ -97,10 +97,12 @@ def user_class(name: str) -> UserClass | None:
 def with_parts(given: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
     """Return names of policies with what "ablation" stands for in its place.
 
-    These are the known ones that are no row of a main table: the parts of what is shipped
-    (`tube-mpc:gain`, ...), and `lqr-plan`, a plain regulator around the same plans.
+    These are the known ones that are no row of a main table: other laws around the plans of what is
+    shipped (`tube-mpc:least-norm`, ...), and `lqr-plan`, a plain regulator around them.
     """
-    parts = [name for name in known if ":" in name or name == "lqr-plan"]
+    # What plans otherwise is no law around the same plans.
+    parts = [name for name in known if ":" in name and not name.endswith(":replan")]
+    parts += [name for name in known if name == "lqr-plan"]
     names = [one for name in given for one in (parts if name == "ablation" else [name])]
     return tuple(dict.fromkeys(names))
 

@@ -1,0 +1,271 @@
+"""Which law should track a plan, and with which weights?
+
+Laws and weights are held against each other around the same plans, under the same disturbances:
+
+- every law of `lagros_policies.expert.LAWS`: the gain of the metric along the plan (shipped), the
+  same projected onto the contracting set, at half and twice the rate, a plain regulator of the same
+  plan, and within the task's CV-STEM metric the least-norm u* and the preference tuned before;
+- the shipped weights with another control weight R, and with another R at the start of an episode:
+  the curve along which the tube is paid for with effort and with exits from the paper's tube.
+
+Columns: success and strict success under every kind of disturbance; effort to success and episodes
+that ever left the paper's tube under `uniform`; the largest error per unit of d_bar that aimed
+sequences reach in the linearised loop and in flight at 0.4 of the bound, over all plans and for
+the median one; how often a projection moves the control; for how many plans a tube is proved.
+
+The weights that the cart-pole ships were found on other episodes by benchmarks/tuning/plan_law.py.
+
+    OMP_NUM_THREADS=1 python benchmarks/studies/plan_law.py [--task cartpole] [--episodes 200]
+        [--proved 20] [--json benchmarks/results/plan_law.json] [--figure FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from lagros_benchmarks.run.files import write_json
+from lagros_benchmarks.worst_case.aimed import aimed_sequences
+from lagros_benchmarks.worst_case.flights import (
+    Episodes,
+    Flights,
+    draw_episodes,
+    fly,
+    parts_of,
+    random_pushes,
+    tracking_law,
+)
+from lagros_benchmarks.worst_case.goals import loop_slopes
+from lagros_envs.numbers import functions
+from lagros_envs.registry import find_task
+from lagros_envs.seeding import episode_seeds
+from lagros_envs.task import Task
+from lagros_policies.expert import LAWS, SHIPPED_LAW, Expert
+from lagros_policies.proof.plan_tube import plan_tubes
+
+_NAMESPACE = 67
+_KINDS = ("uniform", "constant", "gust", "switching")
+# Of the task's bound: where the worst is looked for, and where tubes are asked for.
+_SEARCHED, _PROVED = 0.4, (2.0 / 15.0, 1.0 / 3.0)
+_SMALL = 1e-3  # d_bar at which a flight is as good as linear
+_CONTROL_SHARES = (1.0 / 16.0, 0.25, 4.0, 16.0)
+_EARLY = (0.0, 2.0, 4.0, 6.0)  # logarithm of R at the start in units of R
+
+
+def laws(task: Task) -> Iterator[tuple[str, Expert]]:
+    """Yield what is compared, by name; the shipped law is the first."""
+    for law in (SHIPPED_LAW, *(law for law in LAWS if law != SHIPPED_LAW)):
+        try:
+            yield law, Expert(task, law=law)
+        except (FileNotFoundError, ValueError) as error:
+            Console(stderr=True).print(f"{law}: {error}")
+    own = Expert(task).feedback
+    for share in _CONTROL_SHARES:
+        control = tuple(share * weight for weight in own.control_weights)
+        yield f"R x {share:g}", Expert(task, weights=replace(own, control_weights=control))
+    for early in _EARLY:
+        begun = (early,) * task.system.control_dim
+        weights = replace(own, early_control=begun)
+        yield f"R begins e^{early:g}", Expert(task, weights=weights)
+
+
+def outcomes(episodes: Episodes, flights: Flights) -> dict[str, float]:
+    """Return shares of success, as the environments count them, effort, and exits."""
+    task = episodes.settings
+    times = task.control_period * np.arange(task.steps + 1)
+    goals = np.broadcast_to(episodes.goals[:, None], flights.states.shape)
+    distance = task.goal_distance(parts_of(flights.states), parts_of(goals), functions)
+    whole = flights.alive & ~(flights.lost[:, None] & (np.diff(flights.alive, append=0) != 0))
+    inside = (distance <= task.success_radius(times)) & whole
+    succeeded = inside.any(axis=1)
+    first = np.where(succeeded, inside.argmax(axis=1), task.steps)
+    spent = task.control_period * np.sum(
+        np.square(flights.controls - np.array(task.control_centre)), axis=-1
+    )
+    before = np.arange(task.steps) < first[:, None]
+    found = {
+        "success": float(succeeded.mean()),
+        "strict": float(inside[:, -1].mean()),
+        "effort": float(np.sum(spent * before, axis=1).mean()),
+    }
+    radius = task.tube_radius(times)
+    if radius is not None:
+        error = np.linalg.norm(flights.states - episodes.plans, axis=-1)
+        left = np.any(error[:, 1:] > radius[1:], axis=1) | flights.lost
+        found["left"] = float(left.mean())
+    return found
+
+
+def worst_errors(expert: Expert, episodes: Episodes) -> dict[str, float]:
+    """Return the largest ||e|| per unit of d_bar under aimed sequences, linear and flown."""
+    law, every = tracking_law(expert, episodes), np.arange(len(episodes.seeds))
+    calm = np.zeros((len(every), *episodes.controls.shape[1:2], episodes.plans.shape[-1]))
+    slopes = loop_slopes(episodes, law, every, calm, fly(episodes, law, every, calm))
+    aimed = aimed_sequences(*slopes)
+    each = np.repeat(every, aimed.shape[1])
+    found = {}
+    for name, bound in (
+        ("linear", _SMALL),
+        ("flown", _SEARCHED * episodes.settings.defaults.bound),
+    ):
+        pushes = bound * aimed.reshape(-1, *aimed.shape[2:])
+        flights = fly(episodes, law, each, pushes)
+        error = np.linalg.norm(flights.states - episodes.plans[each], axis=-1).max(axis=1)
+        error = np.where(flights.fallen, np.inf, error).reshape(aimed.shape[:2]).max(axis=1)
+        found[f"{name}_max"] = float(error.max() / bound)
+        found[f"{name}_median"] = float(np.median(error) / bound)
+    return found
+
+
+def projection(expert: Expert, episodes: Episodes, flights: Flights) -> dict[str, float]:
+    """Return how often the projection moves the control along flights, and how far on average."""
+    plain = Expert(expert.task, law="gain", weights=expert.feedback)
+    plans = plain.track(episodes.plans, episodes.controls)
+    count, steps = flights.controls.shape[:2]
+    which, step = np.repeat(np.arange(count), steps), np.tile(np.arange(steps), count)
+    states = flights.states[:, :-1].reshape(count * steps, -1)
+    wanted = plain.control(plans, which, step, states).reshape(flights.controls.shape)
+    moved = np.linalg.norm(flights.controls - wanted, axis=-1)[flights.alive[:, :-1]]
+    # Single precision of the action moves it, too.
+    unit = float(np.linalg.norm(expert.task.control_scale))
+    return {"acts": float(np.mean(moved > 1e-5 * unit)), "moved": float(moved.mean())}
+
+
+def proved_share(expert: Expert, episodes: Episodes, count: int, bound: float) -> float | None:
+    """Return for which share of the first plans a tube of a bound is proved; None of no gain."""
+    task = expert.task
+    tracked = expert.track(episodes.plans[:count], episodes.controls[:count])
+    if tracked.feedback is None or expert.law_name == "projected" or not count:
+        return None
+    tubes = plan_tubes(
+        task.system,
+        task.control_period,
+        tracked.states,
+        tracked.controls,
+        tracked.feedback,
+        bound,
+        control_low=task.control_low,
+        control_high=task.control_high,
+        control_centre=task.control_centre,
+    )
+    return float(np.mean(tubes.closed))
+
+
+def study(task: Task, count: int, proved: int) -> list[dict[str, Any]]:
+    """Fly everything that is compared and return a row for each."""
+    rows: list[dict[str, Any]] = []
+    bound, episodes = task.defaults.bound, None
+    for name, expert in laws(task):
+        episodes = episodes or draw_episodes(expert, episode_seeds(0, count, _NAMESPACE))
+        law, every = tracking_law(expert, episodes), np.arange(len(episodes.seeds))
+        row: dict[str, Any] = {"law": name, "task": task.name, "bound": bound}
+        row |= {"episodes": len(every), "unplanned": len(episodes.unplanned)}
+        for kind in _KINDS:
+            flights = fly(episodes, law, every, random_pushes(episodes, kind, bound))
+            row[kind] = outcomes(episodes, flights)
+            if expert.law_name == "projected":
+                row[kind] |= projection(expert, episodes, flights)
+        row["worst"] = worst_errors(expert, episodes)
+        row["proved"] = {
+            f"{share * bound:.3g}": proved_share(expert, episodes, proved, share * bound)
+            for share in _PROVED
+        }
+        rows.append(row)
+        Console().print(f"{name}: {row['uniform']}")
+    return rows
+
+
+def show(rows: list[dict[str, Any]]) -> None:
+    """Print rows as a table."""
+    if not rows:
+        return
+    table = Table(title=f"{rows[0]['task']}, d̄ = {rows[0]['bound']:g}; success / strict [%]")
+    proved = list(rows[0]["proved"])
+    for heading in (
+        *("law", *_KINDS, "effort", "left %", "‖e‖/d̄ linear", "flown"),
+        *(f"proved % at {bound}" for bound in proved),
+    ):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        worst = row["worst"]
+        table.add_row(
+            row["law"],
+            *(
+                f"{100 * row[kind]['success']:.1f} / {100 * row[kind]['strict']:.1f}"
+                for kind in _KINDS
+            ),
+            f"{row['uniform']['effort']:.3g}",
+            f"{100 * row['uniform'].get('left', np.nan):.1f}",
+            f"{worst['linear_median']:.2f}, {worst['linear_max']:.2f}",
+            f"{worst['flown_median']:.2f}, {worst['flown_max']:.2f}",
+            *(
+                "-" if row["proved"][bound] is None else f"{100 * row['proved'][bound]:.0f}"
+                for bound in proved
+            ),
+        )
+    console = Console(width=190)
+    console.print(table)
+    for kind, flown in ((kind, row[kind]) for row in rows for kind in _KINDS):
+        if "acts" in flown:
+            console.print(
+                f"{kind}: the projection acts in {100.0 * flown['acts']:.3f} % of the steps and "
+                f"moves the control by {flown['moved']:.2g} on average"
+            )
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Draw effort and exits over the worst error of each row."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9.0, 3.6), constrained_layout=True)
+    columns = (("effort", 1.0, "effort"), ("left", 100.0, "left the paper's tube [%]"))
+    for axis, (column, factor, label) in zip(axes, columns, strict=True):
+        for prefix in ("R x", "R begins"):
+            line = [row for row in rows if row["law"].startswith(prefix)]
+            line.append(rows[0])
+            line.sort(key=lambda row: row["worst"]["flown_median"])
+            points = [(r["worst"]["flown_median"], factor * r["uniform"][column]) for r in line]
+            axis.plot(*zip(*points, strict=True), marker=".", label=f"{prefix} ...")
+        for row in rows:
+            if not row["law"].startswith("R "):
+                place = row["worst"]["flown_median"], factor * row["uniform"][column]
+                axis.plot(*place, marker="o", linestyle="none", color="black")
+                axis.annotate(
+                    row["law"], place, fontsize=7, xytext=(4, 3), textcoords="offset points"
+                )
+        axis.set_xlabel("largest error found per unit of d̄, median plan")
+        axis.set_ylabel(label)
+        axis.set_xscale("log")
+    axes[0].legend()
+    figure.savefig(path, dpi=150)
+
+
+def main() -> None:
+    """Run the study from the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--task", default="cartpole")
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--proved", type=int, default=20, help="plans whose tubes are asked for")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--figure", type=Path)
+    options = parser.parse_args()
+    task: Any = find_task(options.task)
+    rows = study(task, options.episodes, options.proved)
+    show(rows)
+    if options.json:
+        write_json(options.json, rows)
+    if options.figure:
+        draw(rows, options.figure)
+
+
+if __name__ == "__main__":
+    main()
