@@ -29,6 +29,7 @@ _OPTIONAL = ("name", "observes", "reseed", "counters", "bare_forward", "example_
 # learned weights are needed only then.
 _SINGLE = {
     "learned": "lagros_policies.learned:LearnedPolicy",
+    "learned-mpc": "lagros_policies.learned:LearnedMpcPolicy",
     "tube-mpc": "lagros_policies.tube_mpc:TubeMpcPolicy",
     "tube-mpc:replan": "lagros_policies.tube_mpc:ReplanningTubeMpcPolicy",
     "lagros": "lagros_policies.lagros:LagrosPolicy",

@@ -33,6 +33,8 @@ FILES = (
     "cartpole_lagros.json",
     "cartpole_learned.safetensors",
     "cartpole_learned.json",
+    "cartpole_learned-mpc.safetensors",
+    "cartpole_learned-mpc.json",
 )
 DAMAGED = (".json", ".npz", ".safetensors")
 
@@ -48,6 +50,9 @@ def small(**changes):
         "data": ExpertDataSettings(plans=8, samples=400, shards=2),
         "lagros": training,
         "learned": training,
+        "replanned": tuple(ExpertDataSettings(4, 80, 2, seed=seed) for seed in range(2)),
+        "mpc_between": training,
+        "learned_mpc": training,
         "episodes": 2,
         "jobs": 1,
     }
@@ -75,12 +80,13 @@ def test_an_interrupted_run_ends_with_the_files_of_one_that_was_not(tmp_path):
     damaged = [path for path in (tmp_path / "broken").rglob("*") if path.suffix in DAMAGED]
     damaged = [path for path in damaged if path.stem not in ("settings", "manifest")]
     damaged = [path for path in damaged if "checkpoint" not in path.stem]
-    assert len(damaged) == len(FILES) + 2
+    # And two shards of each data set, and the network before the round of `learned-mpc`.
+    assert len(damaged) == len(FILES) + 3 * 2 + 1
     for path in damaged:
         path.write_bytes(path.read_bytes()[:-20])
     said = []
     reproduce(tmp_path / "broken", small(), say=said.append)
-    assert sum("it is made again" in line for line in said) == 3
+    assert sum("it is made again" in line for line in said) == 5
     same, different, missing = filecmp.cmpfiles(
         tmp_path / "whole", tmp_path / "broken", FILES, shallow=False
     )
@@ -90,7 +96,8 @@ def test_an_interrupted_run_ends_with_the_files_of_one_that_was_not(tmp_path):
     assert Mlp.load(tmp_path / "whole" / "cartpole_lagros.safetensors").metadata == shipped
 
     run = run_benchmark(benchmark)
-    assert {case.policy for case in run.episodes} == {"learned", "tube-mpc", "lagros", "lqr"}
+    policies = {"learned", "learned-mpc", "tube-mpc", "lagros", "lqr"}
+    assert {case.policy for case in run.episodes} == policies
     assert all(len(records) == 2 for records in run.episodes.values())
 
     other = TrainingSettings(hidden=(16,), epochs=5)
@@ -124,7 +131,7 @@ def test_a_task_of_ones_own_is_made_with_a_round_of_flights_and_gone_on_with(tmp
     with pytest.raises(InterruptedRunError):
         reproduce(tmp_path / "broken", settings, stop_in_the_round)
     benchmark = reproduce(tmp_path / "broken", settings)
-    files = [name.replace("cartpole", "car") for name in FILES]
+    files = [name.replace("cartpole", "car") for name in FILES if "mpc" not in name]
     same, different, missing = filecmp.cmpfiles(
         tmp_path / "whole", tmp_path / "broken", files, shallow=False
     )

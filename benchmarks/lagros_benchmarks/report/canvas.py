@@ -39,6 +39,7 @@ class Style(NamedTuple):
 
 _STYLES = {
     "learned": Style("#E69F00", (0, (5, 1.5, 1, 1.5)), "s"),
+    "learned-mpc": Style("#A6761D", (0, (5, 1.5)), "p"),
     "tube-mpc": Style("#0072B2", (0, (5, 2)), "o"),
     "lagros": Style("#D55E00", "solid", "D"),
     "centralized": Style("#333333", (0, (1, 1)), "^"),

@@ -9,7 +9,13 @@ from pathlib import Path
 from lagros_benchmarks.run.experiment import Row
 
 # The letters that the paper gives its methods.
-_LETTERS = {"learned": "(a)", "tube-mpc": "(b)", "lagros": "(c)", "centralized": "(d)"}
+_LETTERS = {
+    "learned": "(a)",
+    "learned-mpc": "(a′)",
+    "tube-mpc": "(b)",
+    "lagros": "(c)",
+    "centralized": "(d)",
+}
 LONGEST_LABEL = 12
 # What "effort ×" means wherever two policies are compared.
 EFFORT_RATIO = "effort ratio where both succeed"
