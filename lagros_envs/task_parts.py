@@ -87,8 +87,8 @@ class Learning:
             and the time: the form of the law itself. It needs features that are affine in it.
         slope_weight: Of the error of the slope of (c), du/dx against K, in the loss.
         mpc_samples: States labelled by planning from them, for (a) with the care that (c) gets
-            (`learned-mpc`); 0 for none. They come in equal parts from the tube of u* and from each
-            of its rounds; passes are those of (c).
+            (`learned-mpc`): None for as many as (c) has, 0 for no such network. They come in equal
+            parts from the tube of (b) and from each of its rounds; passes are those of (c).
         mpc_rounds: Rounds of DAgger of that network.
     """
 
@@ -105,7 +105,7 @@ class Learning:
     round_epochs: int = 20
     scheduled: bool = False
     slope_weight: float = 0.0
-    mpc_samples: int = 20_000
+    mpc_samples: int | None = None
     mpc_rounds: int = 1
 
 

@@ -25,7 +25,6 @@ from lagros_envs.checks import (
     check_seed,
     check_whole,
 )
-from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.task import Scenario, Task
@@ -34,7 +33,7 @@ from lagros_policies.contraction import Metric
 from lagros_policies.contraction.metric_files import region_record
 from lagros_policies.expert import Expert, TrackedPlans
 from lagros_policies.learning.networks import Mlp
-from lagros_policies.learning.rounds import met_states, padded_discs
+from lagros_policies.learning.rounds import draw_pushes, fallen, met_states, padded_discs
 from lagros_policies.learning.shards import Shard, make_shards
 from lagros_policies.planning import PlannerSettings, Trajectory
 from lagros_policies.room import task_of
@@ -48,8 +47,6 @@ _PATIENCE = 100
 Planned = tuple[Scenario, int, Trajectory]
 # A control nearer to that of the linear law is that of the linear law.
 _SAME = 1e-6
-# Kinds of disturbance whose closed loops fill the tube; `none` would only repeat the plan.
-_KINDS = ("uniform", "sphere", "constant", "sinusoid", "gust")
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,21 +302,6 @@ def _from_first(rows: FloatArray, count: int) -> FloatArray:
     return np.concatenate([np.repeat(rows[:1], count - len(rows), axis=0), rows])
 
 
-def draw_pushes(rng: np.random.Generator, count: int, task: Task, bound: float) -> FloatArray:
-    """Draw disturbances of episodes, each of a kind and a bound of its own, shape (p, N, n)."""
-    # Every bound down to zero: the tube of a small disturbance lies inside that of a large one.
-    bounds = bound * rng.random((count, 1, 1))
-    n, period = task.system.state_dim, task.control_period
-    pushes = np.stack(
-        [
-            OPEN_LOOP[_KINDS[rng.integers(len(_KINDS))]].realise(rng, task.steps, n, period)
-            for _ in range(count)
-        ]
-    )
-    pushes *= bounds
-    return pushes
-
-
 def tube_states(
     rng: np.random.Generator,
     expert: Expert,
@@ -329,8 +311,8 @@ def tube_states(
 ) -> tuple[FloatArray, IntArray, IntArray]:
     """Fill the tube around each plan: u* in closed loop under random disturbances (Theorem 4).
 
-    Each plan is flown once, under a kind and a bound of its own; a ball the size of one more step
-    of disturbance surrounds every state that is met.
+    Each plan is flown once, to a fall, under a kind and a bound of its own; a ball the size of one
+    more step of disturbance surrounds every state that is met.
 
     Args:
         rng: Random generator.
@@ -349,12 +331,14 @@ def tube_states(
     task, period = expert.task, expert.task.control_period
     pushes = draw_pushes(rng, plans, task, settings.disturbance_bound)
     state = states[:, 0]
-    met = np.empty((plans, steps, states.shape[-1]))
+    met = np.full((plans, steps, states.shape[-1]), np.nan)
+    down = np.zeros(plans, bool)
     for step in range(steps):
-        met[:, step] = state
+        met[~down, step] = state[~down]
         control = expert.control(tracked, every, np.full(plans, step), state)
         following = hold_step(task.system, state, control, period, pushes[:, step])
-        state = np.where((first <= step)[:, None], following, state)
+        down |= fallen(task, following)
+        state = np.where((~down & (first <= step))[:, None], following, state)
     spread = settings.spread * settings.disturbance_bound * period
     noise = into_unit_ball(rng.standard_normal(met.shape)) * rng.random((plans, steps, 1))
     # The start is known exactly; the tube has radius zero there.

@@ -24,7 +24,6 @@ from lagros_policies.learning.dataset import (
     ExpertDataSettings,
     Planned,
     ask_once,
-    draw_pushes,
     episodes_of,
     observations,
     plan_arrays,
@@ -33,7 +32,7 @@ from lagros_policies.learning.dataset import (
     tube_states,
 )
 from lagros_policies.learning.networks import Mlp
-from lagros_policies.learning.rounds import LATEST, flown, trouble
+from lagros_policies.learning.rounds import LATEST, draw_pushes, fallen, flown, trouble
 from lagros_policies.learning.shards import Shard, make_shards
 from lagros_policies.planning import Trajectory
 from lagros_policies.planning.planner import Planner
@@ -167,8 +166,9 @@ def _tube(
     tracked = expert.track(arrays["plan_states"], arrays["plan_controls"])
     while True:
         points, plan_of, step = tube_states(rng, expert, tracked, settings)
+        standing = (step <= LATEST * task.steps) & ~fallen(task, points)
         for one in rng.permutation(len(points)):
-            if step[one] <= LATEST * task.steps:
+            if standing[one]:
                 which = int(plan_of[one])
                 yield which, int(step[one]), points[one], held[which][1]
 

@@ -1,4 +1,4 @@
-"""Where a network comes to that flies by itself: the states from which DAgger plans anew."""
+"""Random flights: their disturbances, and where a network comes to, for DAgger to plan anew."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.dynamics import hold_step
 from lagros_envs.dynamics.system import components
 from lagros_envs.numbers import functions
@@ -18,6 +19,8 @@ from lagros_policies.planning.vectors import segment_distance
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+# Kinds of disturbance whose closed loops fill the tube; `none` would only repeat the plan.
+_KINDS = ("uniform", "sphere", "constant", "sinusoid", "gust")
 # Of the episodes that end well, so many are planned anew from somewhere; of the others all, from
 # some time before their end, as shares of the time limit.
 _WELL = 0.3
@@ -31,6 +34,21 @@ def padded_discs(task: Task, episode: Scenario) -> FloatArray:
     discs = np.zeros((task.most_discs, 3))
     discs[: len(episode.discs)] = episode.discs
     return discs
+
+
+def draw_pushes(rng: np.random.Generator, count: int, task: Task, bound: float) -> FloatArray:
+    """Draw disturbances of episodes, each of a kind and a bound of its own, shape (p, N, n)."""
+    # Every bound down to zero: the tube of a small disturbance lies inside that of a large one.
+    bounds = bound * rng.random((count, 1, 1))
+    n, period = task.system.state_dim, task.control_period
+    pushes = np.stack(
+        [
+            OPEN_LOOP[_KINDS[rng.integers(len(_KINDS))]].realise(rng, task.steps, n, period)
+            for _ in range(count)
+        ]
+    )
+    pushes *= bounds
+    return pushes
 
 
 def met_states(
@@ -86,7 +104,7 @@ def flown(task: Task, network: Mlp, episodes: Sequence[Scenario], pushes: FloatA
         control = network(features).astype(np.float64)
         control = np.clip(control if signs is None else control * signs, low, high)
         following = hold_step(task.system, state, control, task.control_period, pushes[:, step])
-        down = _fallen(task, following) | ~np.isfinite(following).all(axis=1)
+        down = fallen(task, following) | ~np.isfinite(following).all(axis=1)
         state = np.where(down[:, None], state, following)
         states[:, step + 1] = state
     return states
@@ -105,6 +123,7 @@ def trouble(task: Task, episodes: Sequence[Scenario], states: FloatArray) -> Boo
     return ended
 
 
-def _fallen(task: Task, states: FloatArray) -> BoolArray:
-    fallen = task.fallen(components(states), functions)
-    return np.broadcast_to(np.asarray(fallen, np.bool_), states.shape[:1])
+def fallen(task: Task, states: FloatArray) -> BoolArray:
+    """Return which states (s, n) are beyond what the task allows, shape (s,)."""
+    found = task.fallen(components(states), functions)
+    return np.broadcast_to(np.asarray(found, np.bool_), states.shape[:1])

@@ -118,6 +118,9 @@ def test_a_task_of_ones_own_is_made_with_a_round_of_flights_and_gone_on_with(tmp
         between=training,
         lagros=training,
         learned=training,
+        replanned=(data, replace(data, seed=1)),
+        mpc_between=training,
+        learned_mpc=training,
         episodes=2,
         jobs=1,
     )
@@ -131,13 +134,14 @@ def test_a_task_of_ones_own_is_made_with_a_round_of_flights_and_gone_on_with(tmp
     with pytest.raises(InterruptedRunError):
         reproduce(tmp_path / "broken", settings, stop_in_the_round)
     benchmark = reproduce(tmp_path / "broken", settings)
-    files = [name.replace("cartpole", "car") for name in FILES if "mpc" not in name]
+    files = [name.replace("cartpole", "car") for name in FILES]
     same, different, missing = filecmp.cmpfiles(
         tmp_path / "whole", tmp_path / "broken", files, shallow=False
     )
     assert (sorted(same), different, missing) == (sorted(files), [], [])
     run = run_benchmark(benchmark)
-    assert {case.policy for case in run.episodes} == {"learned", "tube-mpc", "lagros", "lqr"}
+    policies = {"learned", "learned-mpc", "tube-mpc", "lagros", "lqr"}
+    assert {case.policy for case in run.episodes} == policies
     flown = next(records for case, records in run.episodes.items() if case.policy == "tube-mpc")
     assert all(record.success for record in flown)
 

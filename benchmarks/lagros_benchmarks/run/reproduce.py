@@ -192,7 +192,10 @@ def _data(how: Learning, plans: int, samples: int, seed: int) -> ExpertDataSetti
 
 def _replanned_data(how: Learning) -> tuple[ExpertDataSettings, ...]:
     """Return the parts of the data of `learned-mpc`; () for none."""
-    if not how.mpc_samples:
+    samples = how.mpc_samples
+    if samples is None:
+        samples = how.samples + how.rounds * how.round_samples
+    if not samples:
         return ()
     parts = 1 + how.mpc_rounds
-    return tuple(_data(how, how.plans, how.mpc_samples // parts, seed) for seed in range(parts))
+    return tuple(_data(how, how.plans, samples // parts, seed) for seed in range(parts))
