@@ -121,5 +121,5 @@ def test_a_policy_may_be_a_file(tmp_path):
 
 
 def test_a_mistyped_policy_gets_a_suggestion_and_the_list():
-    with pytest.raises(ValueError, match=r"Did you mean 'tube-mpc'\? Valid: learned, tube-mpc"):
+    with pytest.raises(ValueError, match=r"Did you mean 'tube-mpc'\? Valid: learned, learned-mpc"):
         check_policy("tubempc")

@@ -149,7 +149,7 @@ PLANNED |= {"lqr-plan", "centralized"}
         ("clarabel", PLANNED),
         ("piqp", PLANNED),
         ("scipy", {"lqr", *PLANNED}),
-        ("safetensors", {"learned", "lagros", "ppo", "sac", "td3", "residual"}),
+        ("safetensors", {"learned", "learned-mpc", "lagros", "ppo", "sac", "td3", "residual"}),
         ("torch", set()),
         ("cvxpy", set()),
         ("joblib", set()),
