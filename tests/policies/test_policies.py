@@ -17,6 +17,7 @@ from lagros_policies.lagros import LagrosPolicy
 from lagros_policies.learned import LearnedPolicy
 from lagros_policies.learning.features import seen
 from lagros_policies.tasks.cartpole.features import CartPoleView
+from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
 SHORT = CartPoleSettings(time_limit=3.0, goal_range=1.0)
@@ -139,8 +140,11 @@ print(*failed)
 
 
 # Who plans, of one body and of many.
-PLANNED = {name for name in NAMES if name.startswith("tube-mpc")}
-PLANNED |= {"lqr-plan", "centralized"}
+PLANNED = {
+    name
+    for name in (*NAMES, *SPACECRAFT_NAMES)
+    if name.partition(":")[0] in ("tube-mpc", "lqr-plan", "centralized")
+}
 
 
 @pytest.mark.parametrize(
