@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,6 +129,7 @@ def fit_deep_set(
     settings: DeepSetTraining,
     checkpoint: Path,
     on_epoch: Callable[[int, float], None] | None = None,
+    begun: DeepSet | None = None,
 ) -> DeepSet:
     """Fit a network by Adam on the Huber loss of the scaled accelerations.
 
@@ -140,12 +141,13 @@ def fit_deep_set(
         settings: How to fit.
         checkpoint: File that holds the progress; resumed from if it fits.
         on_epoch: Called with the epochs done and the last epoch's loss.
+        begun: The network whose weights to go on from, of the same widths; None for random ones.
 
     Returns:
         The network, with the normalisation folded in.
     """
     with one_thread():
-        run = _Run(samples, settings, checkpoint)
+        run = _Run(samples, settings, checkpoint, begun)
         run.finish(on_epoch)
         return run.network()
 
@@ -153,7 +155,13 @@ def fit_deep_set(
 class _Run(Fit[DeepSetTraining]):
     """A run over samples whose inputs and labels are scaled."""
 
-    def __init__(self, samples: SetSamples, settings: DeepSetTraining, checkpoint: Path) -> None:
+    def __init__(
+        self,
+        samples: SetSamples,
+        settings: DeepSetTraining,
+        checkpoint: Path,
+        begun: DeepSet | None = None,
+    ) -> None:
         import torch
 
         features, count = samples.features, len(samples)
@@ -178,10 +186,46 @@ class _Run(Fit[DeepSetTraining]):
             dense([own.shape[1] + 2 * wide, *settings.agent, self.target.shape[1]], relu)[:-1],
         ]
         data = hashlib.sha256()
+        if begun is not None:
+            self._go_on_from(begun)
+            for name in sorted(begun.layers):
+                for weight, bias in begun.layers[name]:
+                    data.update(weight.tobytes() + bias.tobytes())
         for array in (own, neighbours, obstacles, self.target):
             data.update(np.ascontiguousarray(array).tobytes())
         parameters = [value for part in self.parts for value in part.parameters()]
         super().__init__(settings, checkpoint, parameters, count, data.hexdigest())
+
+    def _go_on_from(self, begun: DeepSet) -> None:
+        """Take the weights of a network, for inputs and outputs as they are scaled here.
+
+        An input that does not vary in these samples has no scale, and what it says goes into the
+        biases.
+
+        Raises:
+            ValueError: Its widths are others.
+        """
+        import torch
+
+        own, neighbours, obstacles = self.scales
+        layers: list[list[Any]] = [
+            list(begun.layers[name]) for name in ("neighbour", "obstacle", "agent")
+        ]
+        for part, (mean, deviation) in zip(layers, (neighbours, obstacles, own), strict=True):
+            first, bias = (np.array(array, np.float64) for array in part[0])
+            width = len(mean)
+            bias = bias + mean @ first[:width]
+            first[:width] *= np.where(np.isfinite(deviation), deviation, 0.0)[:, None]
+            part[0] = first, bias
+        weight, bias = layers[2][-1]
+        layers[2][-1] = weight / self.target_scale, bias / self.target_scale
+        for module, part in zip(self.parts, layers, strict=True):
+            values = [array for weight, bias in part for array in (np.transpose(weight), bias)]
+            parameters = list(module.parameters())
+            if [tuple(one.shape) for one in parameters] != [np.shape(value) for value in values]:
+                raise ValueError("begun: the network has other widths than are to be fitted")
+            for parameter, value in zip(parameters, values, strict=True):
+                parameter.data = torch.tensor(np.ascontiguousarray(value), dtype=torch.float32)
 
     def batches(self, order: IntArray) -> list[IntArray]:
         """Cut into batches of almost equal sizes."""

@@ -26,6 +26,7 @@ from lagros_policies.learning.train_deep_set import DeepSetTraining
 from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.cartpole.metric_design import MetricDesignSettings
 from lagros_policies.tasks.spacecraft.flights import FlightData, FlightSettings
+from lagros_policies.tasks.spacecraft.station import StationSettings
 
 FILES = (
     "metric.json",
@@ -168,6 +169,9 @@ def small_spacecraft():
         ),
         rounds=(
             FlightSettings(worlds=2, worlds_per_shard=1, agents=(2,), replan_period=9.0, seed=2),
+        ),
+        station=StationSettings(
+            flights=FlightSettings(worlds=2, worlds_per_shard=1, agents=(2,), seed=3)
         ),
         held_out=0.5,
         intermediate=training,

@@ -46,7 +46,7 @@ def spacecraft_certificate(
     thrust: float = 1.0,
     policy: str = "centralized",
     law: GainTracking | None = None,
-    learning_error: float = 0.0,
+    flown: bool = True,
 ) -> Certificate:
     """Return the certificate of a metric of the plane, taken for all three axes.
 
@@ -59,9 +59,8 @@ def spacecraft_certificate(
         thrust: Largest force of a thruster in u_d [N], which bounds the terms of the heading in A.
         policy: What flies.
         law: The law that flies, whose tube is claimed; None for a metric alone, of which Theorem 1
-            and the least-norm u* are, or for a policy that no tube is about.
-        learning_error: Recorded eps_l of a learned policy [m/s^2]. Nothing rests on it, and no tube
-            is claimed where it is not zero.
+            and the least-norm u* are.
+        flown: Whether a law of that metric flies, so that a tube is claimed.
 
     Raises:
         TypeError: The body is no spacecraft.
@@ -96,7 +95,7 @@ def spacecraft_certificate(
         lines, margin = _of_the_gain(law, disturbance_bound)
         reach = "what flies, u_d + K e held for 0.1 s, is proved to stay on its plan to"
         details = {"tubes": {"position_held": margin}, "gain": _gain_record(law)}
-    elif learning_error == 0.0:
+    elif flown:
         radius = state_tube(plane, disturbance_bound).steady_radius * (1.0 + 2.0 * _ROUNDING)
         certified, margin = radius, certified_margin(plane, disturbance_bound)
         lines = _of_the_metric(plane, disturbance_bound, radius, shown)
@@ -110,7 +109,7 @@ def spacecraft_certificate(
         chi=chi,
         nu=nu,
         b_bar=gain,
-        epsilon_l=learning_error / gain,
+        epsilon_l=0.0,
         d_bar=disturbance_bound,
         channels="all",
         basis="1 (W_bar is constant); the state is [x, y, heading, vx, vy, spin]",

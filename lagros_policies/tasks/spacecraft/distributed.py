@@ -116,7 +116,8 @@ class DistributedTubeMpcPolicy(BasePolicy):
         deadline: Delta t_max, after which a plan is late: the last one stays in force, and the late
             one is counted and dropped. An agent that has none yet waits for its first [s]. None for
             the control period.
-        clock: Source of the time, for tests [s].
+        clock: Source of the time [s]; the processor time of the thread, which other work on the
+            machine does not lengthen.
 
     Raises:
         ValueError: A value is out of range, there is no such law, or the thrust limit leaves plans
@@ -125,7 +126,7 @@ class DistributedTubeMpcPolicy(BasePolicy):
 
     name = "tube-mpc"
     prepared = True  # `policy.make` tells it the bound of the environment's disturbance
-    own_law: ClassVar[str] = "gain"
+    own_law: ClassVar[str] = "least-norm"
 
     def __init__(
         self,
@@ -142,7 +143,7 @@ class DistributedTubeMpcPolicy(BasePolicy):
         planner: LocalPlannerSettings | None = None,
         law: str | None = None,
         deadline: float | None = None,
-        clock: Callable[[], float] = time.perf_counter,
+        clock: Callable[[], float] = time.thread_time,
     ) -> None:
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
@@ -315,8 +316,8 @@ class DistributedTubeMpcPolicy(BasePolicy):
         )
 
 
-class LeastNormTubeMpcPolicy(DistributedTubeMpcPolicy):
-    """The same with Theorem 2's least-norm u* of the metric of least chi."""
+class GainTubeMpcPolicy(DistributedTubeMpcPolicy):
+    """The same with the gain that belongs to the metric of that rate."""
 
-    name = "tube-mpc:least-norm"
-    own_law = "least-norm"
+    name = "tube-mpc:gain"
+    own_law = "gain"

@@ -9,7 +9,7 @@ Without disturbance the labels are u_d, which policy (a) imitates.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -159,6 +159,19 @@ def fly_expert(
         "learner": None if learner is None else hashlib.sha256(learner.read_bytes()).hexdigest(),
     }
     shards = make_shards(folder, settings.shards, make, record, jobs, on_shard, backend)
+    return gathered(shards, settings, task)
+
+
+def gathered(
+    shards: Sequence[Shard], settings: FlightSettings, task: SpacecraftSettings
+) -> FlightData:
+    """Return the samples of all shards in one.
+
+    Args:
+        shards: Of the flights, in their order.
+        settings: What was flown.
+        task: The task.
+    """
     observation, acceleration, world = (
         np.concatenate([shard[name] for shard in shards])
         for name in ("observation", "acceleration", "world")
@@ -180,7 +193,7 @@ def make_shard(
     count = settings.worlds_per_shard
     seeds = episode_seeds(settings.seed, settings.worlds)[index * count : (index + 1) * count]
     rng = np.random.default_rng([settings.seed, index])
-    preset = _preset(settings, rng)
+    preset = flown_preset(settings, rng)
     bound = float(settings.disturbance_bound * rng.random())
     episode = SpacecraftEpisode(None, preset, "uniform", bound, "all", None, task, count)
     streams = [episode_streams(seed) for seed in seeds]
@@ -254,7 +267,8 @@ def resize(observation: Float32Array, layout: Layout, larger: Layout) -> Float32
     return resized
 
 
-def _preset(settings: FlightSettings, rng: np.random.Generator) -> Preset:
+def flown_preset(settings: FlightSettings, rng: np.random.Generator) -> Preset:
+    """Draw the number of agents and the density of a shard's worlds."""
     preset = preset_named(settings.preset).for_agents(int(rng.choice(settings.agents)))
     fewest, most = preset.obstacle_count
     return replace(

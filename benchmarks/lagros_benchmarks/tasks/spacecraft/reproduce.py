@@ -1,14 +1,15 @@
 """The spacecraft experiment from nothing: expert flights, networks (a) and (c), their benchmark.
 
 The networks of (c) are fitted in rounds: the first to flights of the expert, each later one also to
-what the one before it met when it flew, labelled by the expert (DAgger). Every stage leaves its
-files in the run's folder and is skipped where they are whole. The same settings give the same
-files, bit for bit on one machine.
+what the one before it met when it flew, labelled by the expert (DAgger). A last stage teaches how
+station is kept. Every stage leaves its files in the run's folder and is skipped where they are
+whole. The same settings give the same files, bit for bit on one machine.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
@@ -40,6 +41,7 @@ from lagros_policies.tasks.spacecraft.flights import (
 )
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.setup import PUBLISHED, spacecraft_range
+from lagros_policies.tasks.spacecraft.station import StationSettings, fly_station
 from lagros_policies.trained_for import weights_record
 
 BOUNDS = (0.2, 0.4, 0.6, 0.8, 1.0)
@@ -65,14 +67,15 @@ class SpacecraftReproduceSettings:
         flights: Flights of the expert under disturbance.
         calm: Its flights without, which (a) imitates.
         rounds: Flights of one network after the other, labelled by the expert.
+        station: Flights of the last of these networks, labelled at the goal by one gain.
         relabelled_weight: How often the samples of these flights count, others once.
         label_limit: Longer labels of these flights are shortened to this [m/s^2]: a plan that
             begins well beside an agent asks for more than it takes to get there.
         least_speed: Samples of these flights of agents slower than this [m/s], under way and far
             from the goal, are left out: rest has no side, and teaches to rest.
         held_out: Share of the worlds of the last round whose samples are never trained on.
-        intermediate: Training of the networks that fly.
-        lagros: Training of (c).
+        intermediate: Training of the networks of the rounds.
+        lagros: Training of (c), from the weights of the last network.
         learned: Training of (a).
         worlds: Paired worlds of the table at each bound.
         bounds: d_bar of the table, uniform in the ball.
@@ -91,12 +94,15 @@ class SpacecraftReproduceSettings:
         default_factory=lambda: FlightSettings(worlds=300, disturbance_bound=0.0, seed=1)
     )
     rounds: tuple[FlightSettings, ...] = field(default_factory=_rounds)
+    station: StationSettings = field(default_factory=StationSettings)
     relabelled_weight: int = 3
     label_limit: float = 2.0
     least_speed: float = 0.12
     held_out: float = 0.1
     intermediate: DeepSetTraining = field(default_factory=DeepSetTraining)
-    lagros: DeepSetTraining = field(default_factory=DeepSetTraining)
+    lagros: DeepSetTraining = field(
+        default_factory=lambda: DeepSetTraining(epochs=4, learning_rate=1e-3)
+    )
     learned: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=4))
     worlds: int = 20
     bounds: tuple[float, ...] = BOUNDS
@@ -126,11 +132,9 @@ class SpacecraftReproduceSettings:
             met = stage.fly(f"{_RELABELLED}{index}", flights, learner)
             kept = training_part(met, self)
             parts += [kept] * self.relabelled_weight
-            last = index == len(self.rounds)
-            name, training = (
-                ("lagros", self.lagros) if last else (f"round{index}", self.intermediate)
-            )
-            learner = stage.fit(name, training, parts, _only(met, _split(met, self.held_out)))
+            test = _only(met, _split(met, self.held_out))
+            learner = stage.fit(f"round{index}", self.intermediate, parts, test)
+        stage.finish(learner)
 
     def benchmark(self, folder: Path | None) -> BenchmarkSettings:
         """Return the benchmark of (a), (b), (c) and (d), with a folder's weights or ours."""
@@ -181,8 +185,34 @@ class _Stage:
         )
         return data
 
+    def finish(self, learner: Path) -> None:
+        """Teach the last network how station is kept: (c)."""
+        begun = perf_counter()
+        settings = self.settings
+        station = settings.station
+        data = fly_station(
+            self.folder / "station",
+            station,
+            self.task,
+            learner,
+            settings.jobs,
+            lambda done: self.progress("station", done, station.flights.shards),
+            settings.backend,
+        )
+        self.say(f"station ({perf_counter() - begun:.0f} s): {len(data.observation)} samples")
+        held_out = _split(data, settings.held_out)
+        parts, test = [_only(data, ~held_out)], _only(data, held_out)
+        labels = json.loads(learner.with_suffix(".json").read_text())["learning_error"]
+        self.fit("lagros", settings.lagros, parts, test, learner, {"labels_error": labels})
+
     def fit(
-        self, name: str, training: DeepSetTraining, parts: list[FlightData], test: FlightData
+        self,
+        name: str,
+        training: DeepSetTraining,
+        parts: list[FlightData],
+        test: FlightData,
+        begun_from: Path | None = None,
+        more: Mapping[str, Any] | None = None,
     ) -> Path:
         """Fit one network, unless its file is whole, and write its record beside it."""
         weights = _weights(self.folder, name)
@@ -194,6 +224,7 @@ class _Stage:
                 training,
                 self.folder / f"{name}_checkpoint.safetensors",
                 lambda epoch, _: self.progress(f"fit {name}", epoch, training.epochs),
+                None if begun_from is None else DeepSet.load(begun_from),
             )
             trained_for = spacecraft_range(self.task, PUBLISHED)
             network.metadata.update(weights_record("spacecraft", name, trained_for))
@@ -207,6 +238,7 @@ class _Stage:
             "samples": sum(len(part.observation) for part in parts),
             "weights": fitted.weights,
             "learning_error": error,
+            **(more or {}),
         }
         write_atomic(weights.with_suffix(".json"), json.dumps(record, indent=1) + "\n")
         self.say(
