@@ -163,6 +163,21 @@ def test_nothing_is_guaranteed_where_no_tube_closes():
     json.dumps(record, allow_nan=False)
     assert record["norm_bound"] is record["state_bounds"] is record["search"]["share_of_bound"]
     assert record["not_shown"] == {"tube": 2}
+    assert record["smaller_bound"] is None
+
+
+def test_a_smaller_bound_is_looked_for_where_nothing_is_guaranteed():
+    loop = linear_loop(SHORT, CARTPOLE, count=2)
+    found = evidence_of(loop, 1.6, (), replace(QUICK, budget=10), most_seconds=60.0)
+    assert found.count == 0
+    bound, count = found.smaller
+    assert count == 2
+    assert 1.6 / bound == pytest.approx(2.0 ** round(np.log2(1.6 / bound)))
+    line = words.headline(SHORT, loop, found, 1.6)
+    assert f"0 of 2 episodes at d̄ = 1.6, and for {count} at d̄ = {bound:.3g}; not shown:" in line
+    assert evidence_of(loop, bound, (), replace(QUICK, budget=10)).count == count
+    # Nothing larger was left out.
+    assert evidence_of(loop, 2.0 * bound, (), replace(QUICK, budget=10)).count < count
 
 
 @pytest.mark.parametrize("policy", ["tube-mpc", "tube-mpc:half-rate", "lqr-plan"])

@@ -43,7 +43,13 @@ def certify(
             "given, 0 for the task's metric in their place."
         ),
     ] = None,
-    seconds: Annotated[float, typer.Option(help="Time for each search for a proof, in s.")] = 60.0,
+    seconds: Annotated[
+        float,
+        typer.Option(
+            help="Time for each search for a proof, and for a smaller bound where nothing is "
+            "guaranteed, in s."
+        ),
+    ] = 60.0,
     largest: Annotated[
         bool,
         typer.Option("--largest", help="Claim the largest multiple of the region that is proved."),
@@ -152,6 +158,8 @@ def verdict(found: Certificate) -> str:
 
     claims = found.statements
     failed = sum(not line.holds for line in claims)
+    if failed and all(line.verdict != "NO" for line in claims):
+        return f"Not every claim is shown: {failed} of {len(claims)} are not, and come first."
     if failed or not claims:
         return f"NOT every claim holds: {failed} of {len(claims)} do not, and come first."
     kinds = [(sum(line.kind == kind for line in claims), kind) for kind in get_args(Kind)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,6 +22,8 @@ from lagros_policies.proof.plan_tube import PlanTubes
 
 # Flights that a search may spend on each episode, and how many sequences climb side by side.
 SEARCH = SearchSettings("gradient", budget=240, restarts=3)
+# A smaller bound is looked for down to this one, and until it is good for this share of episodes.
+_LEAST, _MOST = 1e-4, 0.9
 # Above the rounding of a flight, relative to the bound and as such.
 _ROUNDING = 1e-9
 
@@ -52,6 +55,8 @@ class Evidence:
         asked: Episodes, with those that have no plan.
         tubes: The tubes; None where there are none.
         proved: What they guarantee; None likewise.
+        smaller: A smaller d_bar at which episodes are guaranteed, and how many, where none is at the
+            one that was asked for; None where that was not looked for, or not found.
         worst: What the search found, and the flights.
         flights: All episodes under each kind of random disturbance.
         proof_seconds: Time of tubes and guarantees [s].
@@ -62,6 +67,7 @@ class Evidence:
     asked: int
     tubes: PlanTubes | None
     proved: Guarantees | None
+    smaller: tuple[float, int] | None
     worst: Worst
     flights: tuple[Flights, ...]
     proof_seconds: float
@@ -151,8 +157,35 @@ def errors_of(flights: Flights, plans: FloatArray) -> FloatArray:
     return np.where(flights.alive, error, 0.0)
 
 
+def _proved(loop: Loop, bound: float) -> tuple[PlanTubes, Guarantees] | None:
+    if loop.tubes is None:
+        return None
+    flown, tubes = loop.episodes, loop.tubes(bound)
+    found = guarantees(flown.settings, flown.goals, flown.discs, flown.plans, flown.controls, tubes)
+    return tubes, found
+
+
+def _smaller(loop: Loop, bound: float, most_seconds: float) -> tuple[float, int] | None:
+    """Halve d_bar until most episodes are guaranteed, or time is up; return the last with any."""
+    begun, found = time.monotonic(), None
+    most = _MOST * (len(loop.episodes.seeds) + len(loop.episodes.unplanned))
+    while time.monotonic() - begun < most_seconds and bound > _LEAST:
+        bound = 0.5 * bound
+        made = _proved(loop, bound)
+        count = 0 if made is None else int(np.count_nonzero(made[1].holds))
+        if count:
+            found = bound, count
+        if count >= most:
+            break
+    return found
+
+
 def evidence_of(
-    loop: Loop, bound: float, kinds: Sequence[str], settings: SearchSettings = SEARCH
+    loop: Loop,
+    bound: float,
+    kinds: Sequence[str],
+    settings: SearchSettings = SEARCH,
+    most_seconds: float = 0.0,
 ) -> Evidence:
     """Prove what can be proved of the episodes of a loop, and look for what contradicts it.
 
@@ -161,15 +194,14 @@ def evidence_of(
         bound: d_bar, in units of the state per second.
         kinds: Kinds of random disturbance that are flown besides.
         settings: Of the search.
+        most_seconds: Time to look for a smaller bound where nothing is guaranteed at this one [s].
     """
     watch = Stopwatch()
     flown = loop.episodes
-    tubes = None if loop.tubes is None else loop.tubes(bound)
-    proved = None
-    if tubes is not None:
-        proved = guarantees(
-            flown.settings, flown.goals, flown.discs, flown.plans, flown.controls, tubes
-        )
+    tubes, proved = _proved(loop, bound) or (None, None)
+    smaller = None
+    if proved is not None and not proved.holds.any():
+        smaller = _smaller(loop, bound, most_seconds)
     proof_seconds = watch.lap()
     target = TubeTarget(flown, loop.law, "error", bound, tubes=tubes)
     found = search(target, settings, 0)
@@ -184,6 +216,7 @@ def evidence_of(
         asked=len(flown.seeds) + len(flown.unplanned),
         tubes=tubes,
         proved=proved,
+        smaller=smaller,
         worst=Worst(**vars(target.record), flights=max(one.flights for one in found)),
         flights=flights,
         proof_seconds=proof_seconds,
@@ -219,6 +252,9 @@ def as_json(evidence: Evidence, task: Task) -> dict[str, Any] | None:
         "norm_bound": float(proved.norm[kept].max()) if some else None,
         "goal_distance_bound": float(proved.goal_distance[kept].max()) if some else None,
         "not_shown": not_shown(evidence),
+        "smaller_bound": None
+        if evidence.smaller is None
+        else dict(zip(("d_bar", "guaranteed"), evidence.smaller, strict=True)),
         "seconds": round(evidence.proof_seconds, 3),
         "search": {
             "flights_per_episode": evidence.worst.flights,

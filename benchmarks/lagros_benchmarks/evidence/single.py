@@ -44,7 +44,7 @@ class Question:
         episodes: Episodes that are to be guaranteed, and of each kind of disturbance (worlds); 0
             for what is known without any.
         metric: A file of the user's own; None for ours.
-        seconds: Time for each search for a proof [s].
+        seconds: Time for each search for a proof, and for a bound at which there is one [s].
         largest: Whether the largest multiple of the region is claimed that is proved.
     """
 
@@ -66,7 +66,7 @@ def certify(task: Task, question: Question) -> Certificate:
     """
     policy, bound = question.policy, question.bound
     loop = loop_named(policy, task, episode_seeds(1, question.episodes, CALIBRATION))
-    found = evidence_of(loop, bound, KINDS)
+    found = evidence_of(loop, bound, KINDS, most_seconds=question.seconds)
     flown, observed = flown_line(found, loop, policy, bound)
     proved = as_json(found, task)
     lines: list[Statement] = []

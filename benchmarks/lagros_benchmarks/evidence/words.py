@@ -25,8 +25,12 @@ def headline(task: Task, loop: Loop, found: Evidence, bound: float) -> str:
     if found.contradicted:
         return f"CONTRADICTED in {found.contradicted} episodes by flights: {count} does not hold"
     if not found.count:
+        less = ""
+        if found.smaller is not None:
+            less = f", and for {found.smaller[1]} at d̄ = {found.smaller[0]:.3g}"
         return (
-            f"{count}; not shown: {_missing(found)}; the search found ‖x − x_d‖ up to {worst:.3g}"
+            f"{count}{less}; not shown: {_missing(found)}; the search found ‖x − x_d‖ up to "
+            f"{worst:.3g}"
         )
     what = ["reaches the goal"]
     if task.most_discs:
