@@ -55,8 +55,8 @@ class Evidence:
         asked: Episodes, with those that have no plan.
         tubes: The tubes; None where there are none.
         proved: What they guarantee; None likewise.
-        smaller: A smaller d_bar at which episodes are guaranteed, and how many, where none is at the
-            one that was asked for; None where that was not looked for, or not found.
+        smaller: A smaller d_bar at which episodes are guaranteed, and how many, where none is at
+            the one that was asked for; None where that was not looked for, or not found.
         worst: What the search found, and the flights.
         flights: All episodes under each kind of random disturbance.
         proof_seconds: Time of tubes and guarantees [s].
