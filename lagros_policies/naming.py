@@ -103,8 +103,9 @@ def with_parts(given: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
     # What plans otherwise is no law around the same plans.
     parts = [name for name in known if ":" in name and not name.endswith(":replan")]
     parts += [name for name in known if name == "lqr-plan"]
-    names = [one for name in given for one in (parts if name == "ablation" else [name])]
-    return tuple(dict.fromkeys(names))
+    # What is named beside it stands where it is named; what is named twice stays to be refused.
+    rest = [name for name in parts if name not in given]
+    return tuple(one for name in given for one in (rest if name == "ablation" else [name]))
 
 
 def is_code(name: str) -> bool:
