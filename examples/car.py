@@ -58,7 +58,9 @@ class CarTask(Task):
         point="nominal",
     )
     feedback = Feedback((1.0, 1.0, 0.3, 0.3), (0.06, 0.06))
-    learning = Learning(2000, 120_000, 0.4, (64, 64, 128, 128), 30, 12, 256, 3, 2000, 40_000, 20)
+    learning = Learning(
+        2000, 120_000, 0.4, (64, 64, 128, 128), 30, 12, 256, 3, 2000, 40_000, 20, mpc_samples=0
+    )
     defaults = Defaults(bounds=(0.4,), bound=0.4)
     weights = Path(__file__).parent / "car"
 

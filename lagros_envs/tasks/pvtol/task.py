@@ -72,6 +72,7 @@ class PvtolSettings(Task):
         round_plans=2500,
         round_samples=60_000,
         round_epochs=18,
+        mpc_samples=0,
     )
     defaults = Defaults(bounds=(0.3,), bound=0.3)
 
