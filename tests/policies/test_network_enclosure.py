@@ -8,12 +8,17 @@ from functools import partial
 
 import numpy as np
 import pytest
-from mpmath import mp, mpf
 
 from lagros_envs.numbers import Interval
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.proof.network_enclosure import enclose, relaxation, second_order
-from lagros_policies.proof.network_expansion import box_inputs, expand, pairs, tanh_derivatives
+from lagros_policies.proof.network_expansion import (
+    box_inputs,
+    evaluated,
+    expand,
+    pairs,
+    tanh_derivatives,
+)
 from lagros_policies.proof.rounded import linear
 
 WIDTHS = (3, 20, 20, 2)
@@ -94,29 +99,51 @@ def test_relaxations_win_on_wide_boxes_and_enclose_keeps_the_narrower():
         assert np.all(ends[1].error < ends[0].error) == (wins is relaxation)
 
 
-def test_a_point_is_enclosed_as_exact_arithmetic_has_it():
+@pytest.fixture
+def precise():
+    """Return flint with numbers of 200 bits."""
+    flint = pytest.importorskip("flint")
+    before, flint.ctx.prec = flint.ctx.prec, 200
+    yield flint
+    flint.ctx.prec = before
+
+
+def in_flint(flint, network, point):
+    values = list(point)
+    for index, (weight, bias) in enumerate(layers_of(network)):
+        values = [
+            sum(
+                (one * float(w) for one, w in zip(values, column, strict=True)), flint.arb(float(b))
+            )
+            for column, b in zip(weight.T, bias, strict=True)
+        ]
+        if index < len(network.weights) - 1:
+            values = [one.tanh() for one in values]
+    return values
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 0.1])
+def test_what_flint_proves_of_points_is_inside(size, precise):
     network = random_network(4)
-    centre, _ = boxes(4, 1.0)
-    inputs = box_inputs(centre, np.zeros_like(centre))
+    centre, reach = boxes(4, size)
+    inputs = box_inputs(centre, reach)
+    moved = places(4, reach, 5)
     for found in (second_order(expand(network, inputs)), relaxation(layers_of(network), inputs)):
-        assert np.all(found.error < 1e-11)
-        for row, point in enumerate(centre):
-            with mp.workdps(60):
-                values = [mpf(float(one)) for one in point]
-                for index, (weight, bias) in enumerate(layers_of(network)):
-                    sums = [
-                        sum(
-                            (one * mpf(float(w)) for one, w in zip(values, column, strict=True)),
-                            mpf(float(b)),
-                        )
-                        for column, b in zip(weight.T, bias, strict=True)
-                    ]
-                    last = index == len(network.weights) - 1
-                    values = sums if last else [mp.tanh(one) for one in sums]
-                for one, offset, error in zip(
-                    values, found.offset[row], found.error[row], strict=True
-                ):
-                    assert abs(one - mpf(float(offset))) <= mpf(float(error))
+        if size < 1e-3:
+            # Of what rounding leaves nothing is lost.
+            assert np.all(found.error < 1e-11)
+        for row in range(len(centre)):
+            for e in moved[row]:
+                # The point is where these numbers lead, not where their rounded sum does.
+                point = [
+                    precise.arb(float(c)) + float(d) for c, d in zip(centre[row], e, strict=True)
+                ]
+                values = in_flint(precise, network, point)
+                for out, value in enumerate(values):
+                    line = precise.arb(float(found.offset[row, out]))
+                    for k, d in zip(found.gain[row, out], e, strict=True):
+                        line += precise.arb(float(k)) * float(d)
+                    assert abs(value - line) < precise.arb(float(found.error[row, out]))
 
 
 @pytest.mark.parametrize("size", [0.02, 0.3])
@@ -161,6 +188,33 @@ def test_single_precision_stays_within_what_is_added_for_it(size):
     error = np.abs(flown - in_double(network, points)).max(axis=1)
     assert np.all(error <= found.rounding)
     assert np.all(found.rounding < 5e-3)
+
+
+@pytest.mark.parametrize("size", [0.02, 0.5])
+def test_boxes_may_lie_along_any_axes(size):
+    network = random_network(12)
+    centre, reach = boxes(12, size)
+    axes = np.random.default_rng(12).standard_normal((len(centre), 3, 3))
+    moved = places(12, reach)
+    values = in_double(network, centre[:, None] + np.einsum("bij,bsj->bsi", axes, moved))
+    inputs = box_inputs(centre, reach, axes)
+    for found in (second_order(expand(network, inputs)), relaxation(layers_of(network), inputs)):
+        line = found.offset[:, None] + np.einsum("bmn,bsn->bsm", found.gain, moved)
+        assert np.all(np.abs(values - line) <= found.error[:, None])
+
+
+def test_numbers_at_points_are_those_of_a_box_of_no_size():
+    network = random_network(13)
+    points = np.random.default_rng(13).standard_normal((20, 3)).astype(np.float32)
+    values, rounding = evaluated(network, points.astype(np.float64))
+    exact = in_double(network, points.astype(np.float64))
+    assert np.all(np.abs(values.midpoint - exact) <= values.radius + 1e-14)
+    assert np.all(values.radius < 1e-11)
+    assert np.all(np.abs(network(points) - exact) <= rounding)
+    whole = expand(network, box_inputs(points.astype(np.float64), np.zeros(points.shape)))
+    # There the inputs are rounded, too.
+    assert np.all(rounding <= whole.rounding)
+    assert np.all(rounding > 0.1 * whole.rounding)
 
 
 def test_a_network_with_one_weight_changed_leaves_the_enclosure():
