@@ -14,6 +14,7 @@ from lagros_policies.learning.networks import Mlp
 from lagros_policies.learning.rounds import flown
 from lagros_policies.proof import network_steering
 from lagros_policies.proof.error_set import boxed
+from lagros_policies.proof.guarantee import guarantees
 from lagros_policies.proof.network_steering import NetworkSteering, network_flight
 from lagros_policies.proof.plan_tube import plan_tubes
 from tests.policies import plan_flights
@@ -113,10 +114,10 @@ def test_no_flight_crosses_the_tube_of_a_network(make, tmp_path):
     assert most > 0.75
 
 
-def gains_of(flight):
+def gains_of(flight, count=TASK.steps):
     """Return the gains about the flights, shape (p, N, m, n)."""
     least = boxed(np.full(flight.states[:, 0].shape, 1e-6), 4)
-    steps = range(TASK.steps)
+    steps = range(count)
     places = [(step, least, flight.states[:, step], flight.controls[:, step]) for step in steps]
     return np.stack([flight.steering.steering(*place).gain for place in places], axis=1)
 
@@ -125,6 +126,54 @@ def errors_of(network, scenario, nominal, pushes):
     """Return the errors (f, N + 1, n) of flights of the network under pushes (f, N, n)."""
     states = flown(TASK, network, [scenario] * len(pushes), pushes)
     return states - nominal
+
+
+def shipped():
+    """Return the paper's task and the network of its (c)."""
+    task = CartPoleSettings()
+    return task, LagrosPolicy(task).network
+
+
+def test_the_shipped_network_is_proved_where_nothing_but_a_bound_is_known():
+    task, network = shipped()
+    episodes = [task.sample(np.random.default_rng(seed)) for seed in range(2)]
+    flight = network_flight(task, network, episodes)
+    tubes = plan_tubes(
+        task.system, task.control_period, flight.states, flight.controls, flight.steering, 0.05
+    )
+    found = guarantees(
+        task,
+        np.array([one.goal for one in episodes]),
+        np.zeros((2, 0, 3)),
+        flight.states,
+        flight.controls,
+        tubes,
+    )
+    assert found.holds.all()
+
+
+@pytest.mark.slow
+def test_thousands_of_flights_stay_in_the_tubes_of_the_shipped_network():
+    task, network = shipped()
+    bound, rng = 0.2, np.random.default_rng(5)
+    episodes = [task.sample(np.random.default_rng(seed)) for seed in range(100, 110)]
+    flight = network_flight(task, network, episodes)
+    tubes = plan_tubes(
+        task.system, task.control_period, flight.states, flight.controls, flight.steering, bound
+    )
+    assert tubes.closed.mean() >= 0.9
+    gains, most = gains_of(flight, task.steps), []
+    for plan in np.flatnonzero(tubes.closed):
+        one = flight.states[plan], flight.controls[plan]
+        pushes = plan_flights.hostile(
+            task.system, task.control_period, one, gains[plan], bound, rng, 200, 3
+        )
+        states = flown(task, network, [episodes[plan]] * len(pushes), pushes)
+        share = np.abs(states - one[0])[:, 1:] / tubes.outputs[plan, 1:]
+        assert np.all(share <= 1.0)
+        most.append(share.max())
+    # A tube a tenth too small would have been crossed.
+    assert np.max(most) > 0.9
 
 
 def test_another_gain_crosses_what_was_proved_of_this_one():
