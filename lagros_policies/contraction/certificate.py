@@ -62,6 +62,7 @@ class Certificate:
             draw from.
         headline: What it comes to, in one line; "" for the verdict alone.
         guarantee: What is guaranteed of episodes, as JSON; None where no statement is about them.
+        predicted: What floats say and nothing proves, in words.
     """
 
     task: str
@@ -86,6 +87,7 @@ class Certificate:
     everywhere: bool = False
     headline: str = ""
     guarantee: Mapping[str, Any] | None = None
+    predicted: tuple[str, ...] = ()
 
     @classmethod
     def of_flights(cls, **claims: Any) -> Certificate:
@@ -137,6 +139,7 @@ class Certificate:
                 "observed": _finite(self.tube.observed),
             },
             "guarantee": self.guarantee,
+            "predicted": list(self.predicted),
             "not_proved": list(self.not_proved),
             "holds": self.holds,
             "statements": [

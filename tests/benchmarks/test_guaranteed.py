@@ -15,10 +15,12 @@ from lagros_benchmarks.evidence import columns, guaranteed, words
 from lagros_benchmarks.evidence.columns import Guaranteed
 from lagros_benchmarks.evidence.guaranteed import evidence_of
 from lagros_benchmarks.evidence.loops import Loop, directions_of, loop_named, shown
+from lagros_benchmarks.evidence.predicted import prediction_of, reached
 from lagros_benchmarks.report.records import summarise
 from lagros_benchmarks.report.tables import csv_text, latex_text, markdown_text, terminal_table
 from lagros_benchmarks.run.runner import kept_in, run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_benchmarks.worst_case.aimed import supports
 from lagros_benchmarks.worst_case.flights import applied, draw_episodes, expert_of
 from lagros_benchmarks.worst_case.search import SearchSettings
 from lagros_envs.dynamics import linearise_hold
@@ -254,6 +256,37 @@ def test_the_motions_are_the_plans_that_the_policy_makes(task):
         np.testing.assert_array_equal(state[0].plan.states, flown.plans[index])
         np.testing.assert_array_equal(env.unwrapped.state, flown.initial_states[index])
         np.testing.assert_array_equal(env.unwrapped.scenario.goal, flown.goals[index])
+
+
+def test_what_is_predicted_is_what_small_flights_reach_and_no_more():
+    loop = linear_loop(SHORT, CARTPOLE, count=2)
+    found = prediction_of(loop)
+    bound = 1e-3
+    worst = evidence_of(loop, bound, (), QUICK).worst
+    assert 0.9 * found.error <= worst.error.max() / bound <= 1.01 * found.error
+    assert found.last < found.error
+    # The goal is as far away as the plan leaves it, and as the radius allows.
+    radius = SHORT.success_radius(SHORT.time_limit)
+    assert found.bound == pytest.approx(radius / found.last, rel=0.01)
+    assert "of which nothing is proved" in found.text
+
+
+def test_no_direction_of_a_linear_loop_exceeds_what_is_predicted():
+    rng = np.random.default_rng(2)
+    by_state = 0.8 * rng.uniform(-1.0, 1.0, (3, 12, 3, 3))
+    by_push, output = rng.uniform(-1.0, 1.0, (3, 12, 3, 3)), rng.standard_normal((2, 3))
+    bound = reached(by_state, by_push, output)
+    angles = np.linspace(0.0, np.pi, 721)
+    rays = np.stack([np.cos(angles), np.sin(angles)], axis=-1) @ output
+    best = supports(by_state, by_push, np.broadcast_to(rays, (3, *rays.shape)))[0].max(axis=1)
+    np.testing.assert_array_less(best, bound.max(axis=1) * (1.0 + 1e-12))
+    np.testing.assert_allclose(bound.max(axis=1), best, rtol=0.02)
+
+
+def test_a_prediction_of_a_plane_counts_the_position_alone():
+    task = find_task("examples/car.py")
+    found = prediction_of(linear_loop(task, (1.0, 0.5), count=2))
+    assert found.bound * found.last > task.goal_radius
 
 
 # The columns of a benchmark

@@ -217,8 +217,9 @@ def _numbers(found: Certificate) -> Table:
         rows["W̄(x)"] = f"{terms} coefficient{'s' * (terms != 1)} of {found.basis}"
     for name, value in rows.items():
         table.add_row(Text(name), Text(value))
-    for line in found.not_proved:
-        table.add_row(Text("not proved"), Text(line))
+    for heading, said in (("predicted", found.predicted), ("not proved", found.not_proved)):
+        for line in said:
+            table.add_row(Text(heading), Text(line))
     return table
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from lagros_benchmarks.evidence.calibration import single_statements
 from lagros_benchmarks.evidence.guaranteed import Evidence, as_json, errors_of, evidence_of
 from lagros_benchmarks.evidence.loops import Loop, loop_named
+from lagros_benchmarks.evidence.predicted import prediction_of
 from lagros_benchmarks.evidence.records import recorded
 from lagros_benchmarks.evidence.words import headline, proved_lines, search_line
 from lagros_benchmarks.worst_case.seeds import CALIBRATION
@@ -95,6 +96,7 @@ def certify(task: Task, question: Question) -> Certificate:
         reach="guaranteed flights are proved to stay on their plans to",
         headline=headline(task, loop, found, bound),
         guarantee=proved,
+        predicted=() if loop.tubes is None else (prediction_of(loop).text,),
     )
 
 
