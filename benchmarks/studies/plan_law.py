@@ -5,6 +5,8 @@ Laws and weights are held against each other around the same plans, under the sa
 - every law of `lagros_policies.expert.LAWS`: the gain of the metric along the plan (shipped), the
   same projected onto the contracting set, at half and twice the rate, a plain regulator of the same
   plan, and within the task's CV-STEM metric the least-norm u* and the preference tuned before;
+- `joint`: one metric and one gain for all plans, functions of x_d, from the same condition imposed
+  jointly over samples (`contraction/sampled.py`), at twice the rate;
 - the shipped weights with another control weight R, and with another R at the start of an episode:
   the curve along which the tube is paid for with effort and with exits from the paper's tube.
 
@@ -16,14 +18,18 @@ the median one; how often a projection moves the control; for how many plans a t
 The weights that the cart-pole ships were found on other episodes by benchmarks/tuning/plan_law.py.
 
     OMP_NUM_THREADS=1 python benchmarks/studies/plan_law.py [--task cartpole] [--episodes 200]
-        [--proved 20] [--json benchmarks/results/plan_law.json] [--figure FILE]
+        [--proved 20] [--only NAME,...] [--json benchmarks/results/plan_law.json] [--figure FILE]
+
+With --only, the other rows of the JSON file stay as they are.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +49,14 @@ from lagros_benchmarks.worst_case.flights import (
     tracking_law,
 )
 from lagros_benchmarks.worst_case.goals import loop_slopes
+from lagros_envs.arrays import FloatArray
 from lagros_envs.numbers import functions
 from lagros_envs.registry import find_task
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.task import Task
-from lagros_policies.expert import LAWS, SHIPPED_LAW, Expert
+from lagros_policies.contraction.basis import CONSTANT
+from lagros_policies.contraction.sampled import SampledDesign, design_sampled
+from lagros_policies.expert import LAWS, SHIPPED_LAW, Expert, TrackedPlans
 from lagros_policies.proof.plan_tube import plan_tubes
 
 _NAMESPACE = 67
@@ -56,24 +65,52 @@ _KINDS = ("uniform", "constant", "gust", "switching")
 _SEARCHED, _PROVED = 0.4, (2.0 / 15.0, 1.0 / 3.0)
 _SMALL = 1e-3  # d_bar at which a flight is as good as linear
 _CONTROL_SHARES = (1.0 / 16.0, 0.25, 4.0, 16.0)
+_DESIGNED = 30  # plans that `joint` is designed on
 _EARLY = (0.0, 2.0, 4.0, 6.0)  # logarithm of R at the start in units of R
 
 
-def laws(task: Task) -> Iterator[tuple[str, Expert]]:
-    """Yield what is compared, by name; the shipped law is the first."""
-    for law in (SHIPPED_LAW, *(law for law in LAWS if law != SHIPPED_LAW)):
-        try:
-            yield law, Expert(task, law=law)
-        except (FileNotFoundError, ValueError) as error:
-            Console(stderr=True).print(f"{law}: {error}")
+class JointExpert(Expert):
+    """u_d + K(x_d) e with the gain of one metric for all plans of a task."""
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        own, metric = self.feedback, self.metric
+        drawn = draw_episodes(self, episode_seeds(1, _DESIGNED, _NAMESPACE))
+        design = SampledDesign(
+            2.0 * own.rate,
+            own.state_weights,
+            10.0 * min(own.control_weights),
+            getattr(metric, "basis", None) or CONSTANT,
+        )
+        n, m = task.system.state_dim, task.system.control_dim
+        self._joint = design_sampled(
+            task.system,
+            task.control_period,
+            drawn.plans[:, :-1].reshape(-1, n),
+            drawn.controls.reshape(-1, m),
+            design,
+        )
+
+    def track(self, states: FloatArray, controls: FloatArray, first_step: int = 0) -> TrackedPlans:
+        """Prepare plans; see `Expert.track`."""
+        return TrackedPlans(states, controls, first_step, self._joint.gain(states[:, :-1]))
+
+
+def laws(task: Task) -> dict[str, Callable[[], Expert]]:
+    """Return how to build what is compared, by name; the shipped law is the first."""
     own = Expert(task).feedback
+    found: dict[str, Callable[[], Expert]] = {}
+    for law in (SHIPPED_LAW, *(law for law in LAWS if law != SHIPPED_LAW)):
+        found[law] = partial(Expert, task, law=law)
+    found["joint"] = partial(JointExpert, task)
     for share in _CONTROL_SHARES:
         control = tuple(share * weight for weight in own.control_weights)
-        yield f"R x {share:g}", Expert(task, weights=replace(own, control_weights=control))
+        weights = replace(own, control_weights=control)
+        found[f"R x {share:g}"] = partial(Expert, task, weights=weights)
     for early in _EARLY:
-        begun = (early,) * task.system.control_dim
-        weights = replace(own, early_control=begun)
-        yield f"R begins e^{early:g}", Expert(task, weights=weights)
+        weights = replace(own, early_control=(early,) * task.system.control_dim)
+        found[f"R begins e^{early:g}"] = partial(Expert, task, weights=weights)
+    return found
 
 
 def outcomes(episodes: Episodes, flights: Flights) -> dict[str, float]:
@@ -158,12 +195,17 @@ def proved_share(expert: Expert, episodes: Episodes, count: int, bound: float) -
     return float(np.mean(tubes.closed))
 
 
-def study(task: Task, count: int, proved: int) -> list[dict[str, Any]]:
-    """Fly everything that is compared and return a row for each."""
+def study(task: Task, names: Sequence[str], count: int, proved: int) -> list[dict[str, Any]]:
+    """Fly what is compared and return a row for each; what cannot be built has none."""
     rows: list[dict[str, Any]] = []
-    bound, episodes = task.defaults.bound, None
-    for name, expert in laws(task):
-        episodes = episodes or draw_episodes(expert, episode_seeds(0, count, _NAMESPACE))
+    bound, build = task.defaults.bound, laws(task)
+    episodes = draw_episodes(Expert(task), episode_seeds(0, count, _NAMESPACE))
+    for name in names:
+        try:
+            expert = build[name]()
+        except (FileNotFoundError, ValueError) as error:
+            Console(stderr=True).print(f"{name}: {error}")
+            continue
         law, every = tracking_law(expert, episodes), np.arange(len(episodes.seeds))
         row: dict[str, Any] = {"law": name, "task": task.name, "bound": bound}
         row |= {"episodes": len(every), "unplanned": len(episodes.unplanned)}
@@ -257,9 +299,16 @@ def main() -> None:
     parser.add_argument("--proved", type=int, default=20, help="plans whose tubes are asked for")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--figure", type=Path)
+    parser.add_argument("--only", help="names of rows, such as gain,lqr")
     options = parser.parse_args()
     task: Any = find_task(options.task)
-    rows = study(task, options.episodes, options.proved)
+    names = list(laws(task))
+    found = {}
+    if options.only and options.json and options.json.is_file():
+        found = {row["law"]: row for row in json.loads(options.json.read_text())}
+    asked = options.only.split(",") if options.only else names
+    found |= {row["law"]: row for row in study(task, asked, options.episodes, options.proved)}
+    rows = [found[name] for name in names if name in found]
     show(rows)
     if options.json:
         write_json(options.json, rows)
