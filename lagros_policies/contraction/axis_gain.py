@@ -72,6 +72,35 @@ class AxisGain:
         stiffness = (1.0 - trace + size * size) / period**2
         return cls(stiffness, damping, period)
 
+    @classmethod
+    def regulator(
+        cls, error: float, speed_error: float, acceleration: float, period: float = 0.1
+    ) -> AxisGain:
+        """Return the gain of a linear quadratic regulator, without any metric.
+
+        Along a plan of a double integrator the Riccati recursion has one and the same gain at every
+        instant but the last few.
+
+        Args:
+            error: What the weights take for a large position error, Q_11 = 1 / error^2.
+            speed_error: Likewise of the velocity.
+            acceleration: Likewise of the control, R = 1 / acceleration^2.
+            period: h [s].
+
+        Raises:
+            ValueError: A value is not positive and finite.
+        """
+        from scipy.linalg import solve_discrete_are
+
+        weights = {"error": error, "speed_error": speed_error, "acceleration": acceleration}
+        for name, value in {**weights, "period": period}.items():
+            check_positive(name, value)
+        step, push = flow(period), np.array([[0.5 * period**2], [period]])
+        state, control = np.diag([error**-2, speed_error**-2]), np.array([[acceleration**-2]])
+        value = solve_discrete_are(step, push, state, control)
+        gain = np.linalg.solve(control + push.T @ value @ push, push.T @ value @ step)[0]
+        return cls(float(gain[0]), float(gain[1]), period)
+
     @property
     def gain(self) -> FloatArray:
         """K, shape (2,) [1/s^2, 1/s]."""

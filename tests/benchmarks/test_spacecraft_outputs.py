@@ -169,14 +169,14 @@ def test_the_order_can_be_read_from_the_comparisons(sweep):
 
 def test_sweeps_have_a_column_per_bound_or_number_of_agents(sweep, scale):
     titles = [title for title, _ in tables.sweep_tables(sweep)]
-    assert [title.partition(" ")[0] for title in titles] == ["Success", "Effort", "Δt"]
+    assert [title.partition(" ")[0] for title in titles] == ["Success", "Effort", "Effort", "Δt"]
     _, table = next(tables.sweep_tables(sweep))
     assert [column.header for column in table.columns] == ["d̄", "0.2", "0.8"]
     assert table.row_count == 8
     counts = [
         [column.header for column in table.columns] for _, table in tables.sweep_tables(scale)
     ]
-    assert counts == [["agents", "1", "3"]] * 4
+    assert counts == [["agents", "1", "3"]] * 5
     assert list(tables.sweep_tables(sweep[:8])) == []
 
 
@@ -185,7 +185,7 @@ def test_many_bounds_are_broken_into_tables_that_fit(sweep):
     headings = [
         [column.header for column in table.columns] for _, table in tables.sweep_tables(many)
     ]
-    assert [len(names) for names in headings] == [6, 6, 6, 5, 5, 5]
+    assert [len(names) for names in headings] == [6, 6, 6, 6, 5, 5, 5, 5]
     assert width(printed(many)) <= WIDTH
 
 
@@ -295,7 +295,7 @@ def invoke(tmp_path, monkeypatch):
         (("--agents", "6,six"), "--agents: 'six' is not a whole number"),
         (("--agents", "0"), "agents=0 must be a whole number"),
         (("--safety-filter", "yes"), "Valid: none, all, both"),
-        (("--policies", "lqr"), "Valid: learned, tube-mpc, lagros, centralized"),
+        (("--policies", "lqr"), "Valid: learned, tube-mpc, tube-mpc:gain, lagros, centralized"),
         (("--disturbance", "worst"), "'worst' pushes away"),
         (("--replan-every", "2"), "--replan-every is for one body"),
         (("--scene", "s.gif"), "must end in .png"),

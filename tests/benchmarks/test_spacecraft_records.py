@@ -14,6 +14,7 @@ from lagros_benchmarks.run.files import json_lines_text, write_atomic, write_jso
 from lagros_benchmarks.run.metrics import wilson_interval
 from lagros_benchmarks.run.runner import Case, run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings, Condition
+from lagros_benchmarks.tasks.spacecraft import records
 from lagros_benchmarks.tasks.spacecraft.episodes import AgentRecord, WorldRecord
 from lagros_benchmarks.tasks.spacecraft.experiment import SpacecraftRun
 from lagros_benchmarks.tasks.spacecraft.timing import Timing
@@ -251,3 +252,33 @@ def test_one_world_has_no_interval_over_worlds_but_that_over_agents(flown):
         low, high = row["success_world_ci95"]
         assert low <= row["success_rate"] <= high
         assert not math.isnan(low)
+
+
+def test_what_is_proved_of_worlds_is_counted_and_held_against_the_flights():
+    def proved(seed, error, **changes):
+        part = agent(max_position_error=error)
+        said = {"guaranteed": True, "arriving": True, "position_error_bound": 0.2}
+        return dataclasses.replace(world(seed, part, part, planned=True), **(said | changes))
+
+    sound = (
+        proved(1, 0.1),
+        proved(2, 0.16, arriving=False),
+        proved(3, 0.1, guaranteed=False, arriving=False, position_error_bound=None),
+    )
+    row = records._guarantees(sound)
+    assert row["guaranteed_rate"] == pytest.approx(2 / 3)
+    assert row["guaranteed_arriving_rate"] == pytest.approx(1 / 3)
+    assert row["guaranteed_ci95"] == wilson_interval(2, 3)
+    assert row["bound_over_worst"] == pytest.approx(0.2 / 0.16)
+    assert row["guarantees_contradicted"] == 0
+    crash = dataclasses.replace(proved(4, 0.1), agents=(agent(False, max_position_error=0.1),))
+    wrong = (proved(5, 0.3), crash)
+    assert records._guarantees(wrong)["guarantees_contradicted"] == 2
+    # No statement is about a policy that tracks no plan.
+    assert set(records._guarantees(OURS).values()) == {None}
+
+
+def test_efforts_are_compared_over_the_same_time_too():
+    versus = records.comparison(OURS, THEIRS)
+    # Not of the third world, in which ours raised.
+    assert versus["effort_total_ratio"] == pytest.approx((2 + 4 + 8 + 16) / (4 + 2 + 4 + 2))

@@ -14,12 +14,14 @@ from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_envs.tasks.spacecraft.world import SUBSTEPS
 from lagros_policies.contraction.axis_gain import AxisGain
+from lagros_policies.contraction.feedback import riccati_gains
 from lagros_policies.planning.joint.plan import swept_distances
 from lagros_policies.planning.joint.rest import resting_places
 from lagros_policies.tasks.spacecraft import held_turn
 from lagros_policies.tasks.spacecraft.centralized import CentralizedPolicy
 from lagros_policies.tasks.spacecraft.gain_control import GainTracking, tracking_law
 from lagros_policies.tasks.spacecraft.guarantee import guarantee
+from lagros_policies.tasks.spacecraft.proof import prove_gain
 from lagros_policies.tasks.spacecraft.world_tube import Planned, world_tube
 
 BODY, H = Spacecraft(), 0.1
@@ -64,13 +66,44 @@ def test_the_gain_has_its_rate_and_contracts_its_metric(rate):
     assert after == pytest.approx(np.exp(-2.0 * rate * H) * before, rel=1e-6)
 
 
+def test_the_regulator_is_the_limit_of_the_riccati_recursion():
+    gain = AxisGain.regulator(0.2, 0.5, 1.0, H)
+    steps = 400
+    by_state = np.tile([[1.0, H], [0.0, 1.0]], (steps, 1, 1))
+    by_control = np.tile([[0.5 * H * H], [H]], (steps, 1, 1))
+    weights = np.tile([1.0 / 0.2**2, 1.0 / 0.5**2], (steps + 1, 1)), np.ones((steps, 1))
+    recursion = riccati_gains(by_state, by_control, *weights)
+    assert -recursion[0, 0] == pytest.approx(gain.gain, rel=1e-6)
+    # Along the plan it hardly changes but at its end.
+    assert recursion[: steps - 60, 0] == pytest.approx(
+        np.broadcast_to(recursion[0, 0], (steps - 60, 2)), rel=1e-3
+    )
+
+
+@pytest.mark.parametrize("name", ["gain", "ellipsoid", "lqr"])
+def test_every_gain_contracts_a_metric_of_its_own_exactly(name):
+    tracking = law(name=name)
+    assert prove_gain(tracking.plane)
+    assert prove_gain(tracking.turning)
+    assert isinstance(tracking, GainTracking)
+
+
+def test_another_metric_or_a_faster_rate_is_not_proved(monkeypatch):
+    good = AxisGain.of_rate(2.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(AxisGain, "rate", property(lambda self: 2.0 * (1.0 + 1e-6)))
+        assert not prove_gain(good)
+    monkeypatch.setattr(AxisGain, "dual", property(lambda self: np.eye(2)))
+    assert not prove_gain(good)
+
+
 def test_a_gain_that_lets_errors_grow_is_refused():
     with pytest.raises(ValueError, match="let errors grow"):
         AxisGain(500.0, 1.0, H)
     with pytest.raises(ValueError, match=r"rate=0\.0"):
         AxisGain.of_rate(0.0, H)
-    with pytest.raises(ValueError, match="law='lqr'"):
-        tracking_law("lqr", BODY, H, 2.0, 0.3)
+    with pytest.raises(ValueError, match="law='pid'"):
+        tracking_law("pid", BODY, H, 2.0, 0.3)
 
 
 # The tube.

@@ -91,7 +91,9 @@ class SpacecraftSettings(Described):
         safety_filter="both",
         attack_episodes=3,
         attack_budget=100,
-        certify_policies=("centralized", "centralized:firm", "centralized:ellipsoid", "lagros"),
+        certify_policies=(
+            *("centralized", "centralized:firm", "centralized:ellipsoid", "lqr-plan", "lagros"),
+        ),
         certify_episodes=20,
         speed=4.0,
     )

@@ -19,6 +19,7 @@ POLICIES = {
     "centralized:least-norm": (
         "lagros_policies.tasks.spacecraft.centralized:LeastNormCentralizedPolicy"
     ),
+    "lqr-plan": "lagros_policies.tasks.spacecraft.centralized:LqrPlanPolicy",
     "ppo": "lagros_policies.tasks.spacecraft.ppo:SpacecraftPpoPolicy",
 }
 SPACECRAFT_NAMES = tuple(POLICIES)  # the older name of `policy_names`

@@ -372,10 +372,18 @@ class LeastNormCentralizedPolicy(CentralizedPolicy):
     own_law = "least-norm"
 
 
+class LqrPlanPolicy(CentralizedPolicy):
+    """The same with a plain linear quadratic regulator: a baseline that knows no metric."""
+
+    name = "lqr-plan"
+    own_law = "lqr"
+
+
 # The policies that differ from one another in the law alone.
 CENTRALIZED = (
     CentralizedPolicy,
     FirmCentralizedPolicy,
     EllipsoidCentralizedPolicy,
     LeastNormCentralizedPolicy,
+    LqrPlanPolicy,
 )

@@ -61,7 +61,10 @@ class GainTracking(AxesTracking):
 
 
 # How an error is answered, by name.
-LAWS = ("gain", "least-norm", "ellipsoid")
+LAWS = ("gain", "least-norm", "ellipsoid", "lqr")
+# What a regulator takes for large, by Bryson's rule: the goal's radius, a brisk pace, a thruster's
+# force; half a turn of the body in some seconds.
+_PLANE_WEIGHTS, _TURNING_WEIGHTS = (0.2, 0.5, 1.0), (1.0, 1.0, 0.3)
 
 
 def tracking_law(
@@ -72,7 +75,8 @@ def tracking_law(
     Args:
         name: "gain": u* = u_d + K e with the gain of the rate. "least-norm": the least deviation
             among those that contract, Theorem 2's. "ellipsoid": the gain of the least invariant
-            ellipsoid in the plane, which has no rate to choose.
+            ellipsoid in the plane, which has no rate to choose. "lqr": a linear quadratic
+            regulator's, without a metric or a rate.
         body: The spacecraft.
         period: The hold's [s].
         contraction_rate: alpha in the plane [1/s].
@@ -89,6 +93,9 @@ def tracking_law(
         check_positive(rate, value)
     if name == "least-norm":
         return WrenchTracking.for_rates(body, period, contraction_rate, turning_rate)
+    if name == "lqr":
+        axes = (_PLANE_WEIGHTS, _TURNING_WEIGHTS)
+        return GainTracking(body, *(AxisGain.regulator(*one, period) for one in axes))
     plane = AxisGain.of_rate(contraction_rate, period)
     if name == "ellipsoid":
         plane = _of_the_ellipsoid(period)

@@ -7,8 +7,8 @@ neighbours.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -74,12 +74,19 @@ class WorldRecord(Keepable):
         error: The exception that ended the episode, which is then a failure of every agent; None
             if none did.
         agents: One record per agent.
+        guaranteed: Whether it is proved that nobody collides, whatever the disturbance does; None
+            for a policy that no such statement is about, as of the next two.
+        arriving: Whether it is proved that all arrive, too.
+        position_error_bound: Proved bound of ||p - p_d|| of any agent [m]; None without a tube.
     """
 
     seed: int
     planned: bool | None
     error: str | None
     agents: tuple[AgentRecord, ...]
+    guaranteed: bool | None = None
+    arriving: bool | None = None
+    position_error_bound: float | None = None
 
 
 @dataclass(frozen=True)
@@ -130,6 +137,10 @@ class WorldsLoop(ClosedLoop):
         if all(np.shape(plan.nominal) == wanted for plan in plans):
             self.nominal = np.stack([plan.nominal for plan in plans])
             self.planned = np.array([bool(plan.solved) for plan in plans])
+
+
+# From worlds that have flown to what is proved of each: fields of its `WorldRecord`.
+Prover = Callable[[WorldsLoop], Sequence[dict[str, Any]]]
 
 
 @dataclass
@@ -204,13 +215,18 @@ def make_filter(policy: BasePolicy, env: Any, disturbance_bound: float) -> BaseP
 
 
 def fly(
-    loop: WorldsLoop, seeds: Sequence[int], margin: float | None = None, trace: Trace | None = None
+    loop: WorldsLoop,
+    seeds: Sequence[int],
+    margin: float | None = None,
+    trace: Trace | None = None,
+    prove: Prover | None = None,
 ) -> Flight:
     """Fly one batch of worlds, one per seed and without autoreset, to their end.
 
     An exception in the policy or the environment ends the batch; it is written down and not raised.
     The margin is the certified bound of the position error to x_d [m], or None. A trace, for those
-    who want more than the records, is filled as the batch flies.
+    who want more than the records, is filled as the batch flies. What the prover says of the worlds
+    is written down with them, where they have flown.
     """
     trace = Trace() if trace is None else trace
     counters: dict[str, int] = {}
@@ -220,13 +236,29 @@ def fly(
     with Attempt() as counting:
         counters = loop.counters()
     problem = attempt.error or counting.error
-    return Flight(tuple(_records(loop, seeds, trace, problem, margin)), counters)
+    records = _records(loop, seeds, trace, problem, margin)
+    if prove is not None and problem is None:
+        records = [
+            replace(record, **said) for record, said in zip(records, prove(loop), strict=True)
+        ]
+    return Flight(tuple(records), counters)
 
 
 def fly_chunk(
-    make_env: Any, policy: Any, seeds: Sequence[int], margin: float | None = None
+    make_env: Any,
+    policy: Any,
+    seeds: Sequence[int],
+    margin: float | None = None,
+    prove: Prover | None = None,
 ) -> Flight:
     """Fly worlds in one batch, and one by one where that raises or the policy draws for itself.
+
+    Args:
+        make_env: Makes an environment of so many worlds.
+        policy: The policy.
+        seeds: Of the worlds.
+        margin: The certified bound of the position error to x_d [m], or None.
+        prove: Says what is proved of the worlds flown, or None.
 
     Returns:
         The records, in the order of the seeds, and the counters.
@@ -235,11 +267,11 @@ def fly_chunk(
     # What a policy draws comes from the stream of one episode.
     alone = len(seeds) == 1 or policy.draws
     if not alone:
-        flight = fly(WorldsLoop(make_env(len(seeds)), policy), seeds, margin)
+        flight = fly(WorldsLoop(make_env(len(seeds)), policy), seeds, margin, prove=prove)
         if all(world.error is None for world in flight.worlds):
             return flight
     loop = WorldsLoop(make_env(1), policy)
-    flights = [fly(loop, [seed], margin) for seed in seeds]
+    flights = [fly(loop, [seed], margin, prove=prove) for seed in seeds]
     counters = added_up(flight.counters for flight in flights)
     return Flight(tuple(world for flight in flights for world in flight.worlds), counters)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,7 +15,7 @@ from lagros_benchmarks.run.keeping import Kept
 from lagros_benchmarks.run.library import Toolbox, building, built_policy
 from lagros_benchmarks.run.settings import BenchmarkSettings, Case
 from lagros_benchmarks.run.workers import Progress
-from lagros_benchmarks.tasks.spacecraft.claims import position_margin
+from lagros_benchmarks.tasks.spacecraft.claims import position_margin, tracked_with_a_gain
 from lagros_benchmarks.tasks.spacecraft.episodes import (
     Flight,
     Trace,
@@ -25,6 +26,7 @@ from lagros_benchmarks.tasks.spacecraft.episodes import (
     make_filter,
     make_worlds,
 )
+from lagros_benchmarks.tasks.spacecraft.guaranteed import proved
 from lagros_benchmarks.tasks.spacecraft.timing import PLAN_WORLDS, Timing, time_plans, time_policy
 from lagros_envs.arrays import FloatArray
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
@@ -146,7 +148,9 @@ class SpacecraftExperiment:
         def worlds(count: int) -> SpacecraftVectorEnv:
             return self.environment(case, count)
 
-        return fly_chunk(worlds, policy, units, margin)
+        bound = case.condition.bound
+        prove = partial(proved, policy=policy, bound=bound) if tracked_with_a_gain(policy) else None
+        return fly_chunk(worlds, policy, units, margin, prove)
 
     def time(self, case: Case, units: Sequence[int]) -> list[Timing]:
         """Measure the times of the calls, and of more plans than those worlds need."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from lagros_benchmarks.tasks.spacecraft.aimed import Aimed
 from lagros_benchmarks.tasks.spacecraft.claims import tracked_with_a_gain
-from lagros_benchmarks.tasks.spacecraft.episodes import make_worlds
+from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, make_worlds
 from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.statement import Statement, at_most
@@ -219,6 +219,27 @@ def _fly(
     collided, success = (np.reshape(info[name], (-1, agents)) for name in ("collided", "success"))
     missed = np.asarray(~np.all(success, axis=1))
     return (error, np.asarray(np.any(collided, axis=1)), missed), memory
+
+
+def proved(loop: WorldsLoop, policy: Any, bound: float) -> list[dict[str, Any]]:
+    """Return what is proved of worlds that have flown, as fields of their records.
+
+    Args:
+        loop: The worlds, and what the policy remembers of them.
+        policy: It tracks joint plans with a gain.
+        bound: d_bar, in units of the state per second.
+    """
+    said = []
+    for world, memory in enumerate(loop.memory):
+        found = _proved(loop.env, policy, world, memory, bound)
+        said.append(
+            {
+                "guaranteed": found is not None and found.collision_free,
+                "arriving": found is not None and found.arriving,
+                "position_error_bound": None if found is None else found.position_error,
+            }
+        )
+    return said
 
 
 def _proved(

@@ -36,6 +36,7 @@ def figures(run: SpacecraftRun, case: Case) -> Row:
         **_efforts(worlds),
         **_times(run.timing[case], run.control_period),
         **_tracking(worlds),
+        **_guarantees(worlds),
         "counters": dict(run.counters[case]),
     }
 
@@ -153,6 +154,38 @@ def _tracking(worlds: Sequence[WorldRecord]) -> Row:
     }
 
 
+def _guarantees(worlds: Sequence[WorldRecord]) -> Row:
+    """What is proved of the worlds; None where nothing is of a policy's."""
+    names = ("guaranteed_rate", "guaranteed_ci95", "guaranteed_arriving_rate")
+    row: Row = dict.fromkeys((*names, "bound_over_worst", "guarantees_contradicted"))
+    if any(world.guaranteed is None for world in worlds):
+        return row
+    kept = [world for world in worlds if world.guaranteed]
+    row |= {
+        "guaranteed_rate": len(kept) / len(worlds),
+        "guaranteed_ci95": wilson_interval(len(kept), len(worlds)),
+        "guaranteed_arriving_rate": sum(bool(world.arriving) for world in worlds) / len(worlds),
+        "guarantees_contradicted": sum(map(_contradicts, worlds)),
+    }
+    worst = max((_worst(world) for world in kept), default=0.0)
+    if worst > 0.0:
+        bounds = [world.position_error_bound or np.inf for world in kept]
+        row["bound_over_worst"] = float(max(bounds) / worst)
+    return row
+
+
+def _worst(world: WorldRecord) -> float:
+    return max(agent.max_position_error or 0.0 for agent in world.agents)
+
+
+def _contradicts(world: WorldRecord) -> bool:
+    """Return whether a world did what was proved to be impossible."""
+    beyond = world.position_error_bound is not None and _worst(world) > world.position_error_bound
+    collided = world.guaranteed and any(agent.collided for agent in world.agents)
+    missed = world.arriving and not all(agent.success for agent in world.agents)
+    return bool(beyond or collided or missed)
+
+
 def comparison(ours: Sequence[WorldRecord], theirs: Sequence[WorldRecord]) -> Row:
     """Return the difference in success and the ratio of efforts of the agents that both solve."""
     mine = _each(ours, "success")
@@ -167,6 +200,11 @@ def comparison(ours: Sequence[WorldRecord], theirs: Sequence[WorldRecord]) -> Ro
     spent = np.where(both, _each(ours, "effort"), 0.0)
     reference = np.where(both, _each(theirs, "effort"), 0.0)
     measurable = reference.sum() > 0.0
+    # Over the same time: of all agents, of worlds that neither policy ended early.
+    whole = np.array(
+        [a.error is None and b.error is None for a, b in zip(ours, theirs, strict=True)]
+    )
+    totals = [_each(worlds, "effort_total")[whole].sum() for worlds in (ours, theirs)]
     return {
         "success_difference": success.difference,
         "success_difference_ci95": success.interval,
@@ -177,5 +215,6 @@ def comparison(ours: Sequence[WorldRecord], theirs: Sequence[WorldRecord]) -> Ro
         "effort_ratio_ci95": cluster_interval(spent.sum(axis=1), reference.sum(axis=1))
         if measurable
         else None,
+        "effort_total_ratio": float(totals[0] / totals[1]) if totals[1] > 0.0 else None,
         "agents_both_solve": int(both.sum()),
     }

@@ -149,7 +149,10 @@ def sweeps(rows: Sequence[Row]) -> Iterator[tuple[str, list[str], list[list[str]
         for begin in range(0, len(points), _MOST_COLUMNS):
             part = points[begin : begin + _MOST_COLUMNS]
             shown = [row for row in series if _point(row, scale) in part]
-            for name, _, content in (_SUCCESS, _EFFORT, _DELAY, *((_BATCH,) if scale else ())):
+            measures = [_SUCCESS, _EFFORT, _TOTAL, _DELAY, *([_BATCH] if scale else [])]
+            if any(row.get("guaranteed_rate") is not None for row in shown):
+                measures.insert(1, _GUARANTEED)
+            for name, _, content in measures:
                 yield _sweep(name, content, shown, part, scale)
 
 
@@ -205,6 +208,20 @@ def _success(row: Row) -> str:
 
 _SUCCESS: Column = ("Success [%], ± the wider side of its 95 % interval over worlds", "", _success)
 _EFFORT: Column = ("Effort [N²s]", "", _effort)
+_TOTAL: Column = (
+    "Effort over the same time, to the time limit [N²s]",
+    "",
+    lambda row: number(row["effort_total_mean"]),
+)
+_GUARANTEED: Column = (
+    "Worlds proved collision-free / and arriving, for every disturbance of the bound [%]",
+    "",
+    lambda row: (
+        "–"
+        if row.get("guaranteed_rate") is None
+        else f"{percent(row['guaranteed_rate'])} / {percent(row['guaranteed_arriving_rate'])}"
+    ),
+)
 _DELAY: Column = (
     "Δt [ms], median: one agent's decision, or one plan for all agents",
     "",
