@@ -27,6 +27,7 @@ from lagros_policies.proof.error_set import ROUNDING, WIDER, ErrorSet
 from lagros_policies.proof.remainder import (
     cubic_forms,
     cubic_lines,
+    narrower_lines,
     narrower_range,
     quadratic_forms,
     quadratic_range,
@@ -68,6 +69,12 @@ class HoldOfErrors:
         curved = int(self.curved.sum())
         return monomials(curved, self.curved.size - curved, int(self.channels.sum()))
 
+    @property
+    def drift(self) -> FloatArray:
+        """How d moves the state within half a hold, at most and by itself, shape (n, channels)."""
+        drift: FloatArray = 0.5 * self.period * self.bound * np.eye(len(self.channels))
+        return drift[:, self.channels]
+
     def following(
         self,
         errors: ErrorSet,
@@ -88,7 +95,7 @@ class HoldOfErrors:
         Returns:
             The errors, and for which plans they are known, shape (p,); the others are at zero.
         """
-        domain = _Domain.around(errors, steering, self.curved)
+        domain = _Domain.around(errors, steering, self.drift, self.curved)
         place = np.concatenate([state + errors.centre, control + steering.offset], axis=1)
         kept = self.monomials
         ended = self._ended(domain, place)
@@ -97,7 +104,9 @@ class HoldOfErrors:
         known = domain.known & np.isfinite(parts).all(axis=(1, 2)) & np.isfinite(rest).all(axis=1)
         parts = np.where(known[:, None, None], parts, 0.0)
         rest = np.where(known[:, None], rest, 0.0)
-        basis, middle, lines, radius = _remainder(kept, parts, domain.blocks(errors, steering))
+        basis, middle, lines, radius = _remainder(
+            kept, parts, domain.blocks(errors, steering, self.drift)
+        )
         by_curved = parts[:, :, kept.first[0]] + basis @ lines
         matrix, lost = domain.slopes(by_curved, parts[:, :, kept.first[1]])
         slope = matrix @ domain.rows
@@ -106,14 +115,14 @@ class HoldOfErrors:
         lost += ROUNDING * _times(np.abs(basis), np.abs(lines).sum(axis=-1) + np.abs(middle))
         lost += ROUNDING * (np.abs(parts[:, :, 0]) + np.abs(following))
         centre = parts[:, :, 0] - following + _times(basis, middle)
+        pushes = parts[:, :, kept.first[2]] + matrix[:, :, : len(self.drift)] @ self.drift
+        lost += ROUNDING * (np.abs(matrix[:, :, : len(self.drift)]) @ self.drift).sum(axis=-1)
         radius = (radius + _times(_transposed(np.abs(basis)), lost)) * WIDER
         # The directions of the remainder are orthogonal but for rounding.
         radius += _ROOM * lost.sum(axis=-1, keepdims=True)
         n = state.shape[1]
         segments = [basis * radius[:, None], matrix[:, :, n:] * steering.radius[:, None]]
-        result = errors.moved(
-            slope, centre, parts[:, :, kept.first[2]], np.concatenate(segments, axis=2) * WIDER
-        )
+        result = errors.moved(slope, centre, pushes, np.concatenate(segments, axis=2) * WIDER)
         known &= np.all(result.spread + np.abs(centre) < _LOST, axis=1)
         return (result if known.all() else result.emptied(~known)), known
 
@@ -132,12 +141,15 @@ class HoldOfErrors:
                 parts[lone.start + index - before] = domain.width[:, index]
             # What rounded the place, and nothing else: the rows of `scale` are as they are.
             numbers.append(TaylorModel(kept, parts, ROUNDING * np.abs(place[:, index])))
+        # The state half-way is what varies: from there d moves it half as far as from the start.
         pushes: list[TaylorModel | float] = []
         for index, moved in enumerate(self.channels.tolist()):
             parts = np.zeros((kept.count, plans))
             if moved:
                 parts[pushed.start + int(self.channels[:index].sum())] = self.bound
-            pushes.append(TaylorModel(kept, parts, np.zeros(plans)) if moved else 0.0)
+            push = TaylorModel(kept, parts, np.zeros(plans)) if moved else 0.0
+            pushes.append(push)
+            numbers[index] = numbers[index] - push * (0.5 * self.period)
         n = self.system.state_dim
         found = rk4_hold(self.system, numbers[:n], numbers[n:], pushes, self.period, functions)
         # A rate may be a plain number, but then x is not.
@@ -163,8 +175,10 @@ class _Domain:
     curved: BoolArray
 
     @classmethod
-    def around(cls, errors: ErrorSet, steering: Steering, curved: BoolArray) -> _Domain:
-        """Enclose states and controls of a set of errors."""
+    def around(
+        cls, errors: ErrorSet, steering: Steering, drift: FloatArray, curved: BoolArray
+    ) -> _Domain:
+        """Enclose states half-way and controls of a set of errors."""
         plans, n = errors.centre.shape
         m = steering.gain.shape[1]
         rows = np.concatenate(
@@ -172,12 +186,16 @@ class _Domain:
         )
         noise = np.zeros((plans, n + m, m))
         noise[:, n + np.arange(m), np.arange(m)] = steering.radius
-        width = np.maximum((errors.support(rows) + noise.sum(axis=-1)) * WIDER, _THIN)
+        moved = np.zeros((n + m, drift.shape[1]))
+        moved[:n] = drift
+        reach = errors.support(rows) + noise.sum(axis=-1) + np.abs(moved).sum(axis=-1)
+        width = np.maximum(reach * WIDER, _THIN)
         unit = 1.0 / width[:, curved, None]
         some = rows[:, curved] * unit
         segments = np.concatenate([some @ errors.segments, noise[:, curved] * unit], axis=2)
         flat = some @ errors.balls.reshape(plans, n, -1)
         balls = flat.reshape(plans, some.shape[1], *errors.balls.shape[2:])
+        balls = np.concatenate([balls, (moved[curved] * unit)[:, :, None]], axis=2)
         shape = ErrorSet.ellipsoid(balls, segments)
         # Rounding of the generators, as a share of the width: where gains cancel it counts.
         share = ROUNDING * _times(np.abs(some), errors.spread).max(axis=1)
@@ -190,15 +208,17 @@ class _Domain:
         scale = np.where(known[:, None, None], scale, np.eye(shape.shape[1]))
         return cls(rows, width, scale, known, curved)
 
-    def blocks(self, errors: ErrorSet, steering: Steering) -> FloatArray:
+    def blocks(self, errors: ErrorSet, steering: Steering, drift: FloatArray) -> FloatArray:
         """Return G_j G_j' of the balls and segments whose sum y lies in, shape (p, j, r, r)."""
         plans, n = errors.centre.shape
         noise = np.zeros((plans, self.rows.shape[1], steering.gain.shape[1]))
         noise[:, n:] = steering.radius[:, :, None] * np.eye(steering.gain.shape[1])
-        columns = np.concatenate([self.rows @ errors.generators, noise], axis=2)
+        moved = np.zeros((plans, self.rows.shape[1], drift.shape[1]))
+        moved[:, :n] = drift
+        columns = np.concatenate([moved, self.rows @ errors.generators, noise], axis=2)
         columns = np.where(self.known[:, None, None], columns[:, self.curved], 0.0)
         columns = np.linalg.solve(self.scale, columns)
-        count, width = errors.balls.shape[2:]
+        count, width = errors.balls.shape[2] + 1, errors.balls.shape[3]
         balls = columns[:, :, : count * width].reshape(plans, columns.shape[1], count, width)
         balls = np.moveaxis(balls, 2, 1)
         thin = np.moveaxis(columns[:, :, count * width :], 2, 1)[..., None]
@@ -246,6 +266,9 @@ def _remainder(
     )
     forms = cubic_forms(turned[:, :, places[1]], kept.members[places[1]], kept.variables)
     lines, left = cubic_lines(forms)
+    lines[:, most], left[:, most] = narrower_lines(
+        forms[:, most], lines[:, most], left[:, most], blocks
+    )
     mixed = np.sqrt((turned[:, :, places[2]] ** 2).sum(axis=-1))
     size = np.abs(bent).sum(axis=(1, 2))[:, None]
     return basis, middle, lines, (radius + left + mixed + 1e-13 * size) * WIDER

@@ -7,6 +7,7 @@ is left after middle and line counts as a remainder of a linear error.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,6 +21,8 @@ _ROUNDING = 1e-12
 _ROOM = 1e-8
 # Ellipsoids that are turned one after the other.
 _PASSES = 3
+# Of the mean weight, what a ball across the direction of an ellipsoid keeps at least.
+_SHARE = 0.01
 # Slices of the ball along one coordinate, and halvings of the slope of the line.
 _SLICES = 48
 _HALVINGS = 7
@@ -77,28 +80,65 @@ def narrower_range(
     Returns:
         Middle and radius of the range, each (p, k).
     """
-    plans, count, size, _ = blocks.shape
-    flat = blocks.reshape(plans, count, -1)
+    flat = blocks.reshape(*blocks.shape[:2], -1)
     slack = _ROOM * np.sqrt((forms * forms).sum(axis=(-1, -2)))
     ends = []
     for side, known in ((forms, middle + radius), (-forms, radius - middle)):
         lengths = np.trace(blocks, axis1=-2, axis2=-1)[:, None]
         for _ in range(_PASSES):
-            weights = np.sqrt(np.maximum(lengths, 0.0))
-            weights = weights + (1e-2 / count) * weights.sum(axis=-1, keepdims=True) + 1e-100
-            shape = (1.0 / weights) @ flat * weights.sum(axis=-1, keepdims=True)
-            shape = shape.reshape(plans, -1, size, size) + _ROOM * np.eye(size)
-            root = np.linalg.cholesky(shape)
+            root, spread = _turned(flat, lengths)
             values, vectors = np.linalg.eigh(np.swapaxes(root, -1, -2) @ side @ root)
-            spread = 1.0 + np.trace(shape, axis1=-2, axis2=-1)
             known = np.minimum(known, np.maximum(values[..., -1], 0.0) + slack * spread)
             # The longest y is supported along P^-1 y.
-            along = np.linalg.solve(np.swapaxes(root, -1, -2), vectors[..., -1:])
-            pairs = (along * np.swapaxes(along, -1, -2)).reshape(plans, -1, size * size)
-            lengths = pairs @ np.swapaxes(flat, -1, -2)
+            lengths = _lengths(flat, np.linalg.solve(np.swapaxes(root, -1, -2), vectors[..., -1:]))
         ends.append(known)
     high, low = ends
     return 0.5 * (high - low), 0.5 * (high + low) * WIDER
+
+
+def narrower_lines(
+    forms: FloatArray, lines: FloatArray, left: FloatArray, blocks: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Enclose T[y, y, y] over a sum of balls and segments inside ||y|| <= 1 more closely by lines.
+
+    Args:
+        forms: T, symmetric, shape (p, k, r, r, r).
+        lines: a of lines over the ball, shape (p, k, r).
+        left: b of these, shape (p, k).
+        blocks: As in `narrower_range`.
+
+    Returns:
+        a and b of the narrower ones.
+    """
+    flat = blocks.reshape(*blocks.shape[:2], -1)
+    wide = forms.reshape(*forms.shape[:-2], -1)
+    _, vectors = np.linalg.eigh(wide @ np.swapaxes(wide, -1, -2))
+    root, spread = _turned(flat, _lengths(flat, vectors[..., -1:]))
+    turned = np.einsum("pkabc,pkcf->pkabf", forms, root)
+    turned = np.einsum("pkabf,pkbe->pkaef", turned, root)
+    turned = np.einsum("pkaef,pkad->pkdef", turned, root)
+    slopes, found = cubic_lines(turned)
+    found = found + _ROOM * spread * np.sqrt((forms * forms).sum(axis=(-1, -2, -3)) * spread)
+    back = np.linalg.solve(np.swapaxes(root, -1, -2), slopes[..., None])[..., 0]
+    better = found < left
+    return np.where(better[..., None], back, lines), np.where(better, found, left)
+
+
+def _turned(flat: FloatArray, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a root of P for squared lengths of blocks (p, k, j), and one and the trace of P."""
+    size = math.isqrt(flat.shape[-1])
+    weights = np.sqrt(np.maximum(lengths, 0.0))
+    weights = weights + (_SHARE / flat.shape[1]) * weights.sum(axis=-1, keepdims=True) + 1e-100
+    shape = (1.0 / weights) @ flat * weights.sum(axis=-1, keepdims=True)
+    shape = shape.reshape(*shape.shape[:2], size, size) + _ROOM * np.eye(size)
+    return np.linalg.cholesky(shape), 1.0 + np.trace(shape, axis1=-2, axis2=-1)
+
+
+def _lengths(flat: FloatArray, along: FloatArray) -> FloatArray:
+    """Return l'G_j G_j'l for directions l (p, k, r, 1), shape (p, k, j)."""
+    pairs = along * np.swapaxes(along, -1, -2)
+    lengths: FloatArray = pairs.reshape(*pairs.shape[:2], -1) @ np.swapaxes(flat, -1, -2)
+    return lengths
 
 
 def cubic_lines(forms: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -187,7 +187,7 @@ def test_polynomials_of_a_hold_and_their_rest_enclose_what_flint_proves_of_the_s
     errors, _ = wide_set(rng, n, 0.15)
     gain = np.array([[[1.5, 22.0, 3.0, 5.0]]])
     steering = Steering(gain, np.zeros((1, 1)), np.full((1, 1), 0.1))
-    domain = hold_error._Domain.around(errors, steering, hold.curved)
+    domain = hold_error._Domain.around(errors, steering, hold.drift, hold.curved)
     ended = hold._ended(domain, np.concatenate([state, control], axis=1))
     kept = hold.monomials
     before, flint.ctx.prec = flint.ctx.prec, 200
@@ -203,6 +203,9 @@ def test_polynomials_of_a_hold_and_their_rest_enclose_what_flint_proves_of_the_s
                 moved = sum(flint.arb(float(b)) * one for b, one in zip(row, y[:4], strict=True))
                 numbers.append(flint.arb(float(place)) + moved)
             pushes = [flint.arb(hold.bound) * one for one in y[5:]]
+            # The variables are of the state half-way through the hold, but for what moves it.
+            half = flint.arb(0.5 * PERIOD)
+            numbers[:4] = [one - half * d for one, d in zip(numbers[:4], pushes, strict=True)]
             true = rk4_hold(system, numbers[:4], numbers[4:], pushes, PERIOD, functions)
             for value, model in zip(true, ended, strict=True):
                 total = flint.arb(0)
@@ -335,30 +338,35 @@ def test_forms_over_the_ball_are_enclosed(size):
     assert np.all(off <= left)
 
 
-def test_forms_over_a_sum_inside_the_ball_are_enclosed_more_closely():
-    rng = np.random.default_rng(15)
+def inner_sum(rng):
+    """Return blocks of a sum of balls and segments inside the unit ball, and its members."""
     balls, segments = rng.normal(size=(1, 4, 5, 4)), rng.normal(size=(1, 4, 6))
+    # Longer in some directions, as sets of errors are.
+    balls *= np.array([3.0, 1.0, 1.0, 0.3])[None, :, None, None]
     scale = np.linalg.cholesky(ErrorSet.ellipsoid(balls, segments)[0] * (1.0 + 1e-9))
     balls = np.linalg.solve(scale, balls.reshape(1, 4, -1)).reshape(balls.shape)
     segments = np.linalg.solve(scale, segments)
     found = ErrorSet(np.zeros((1, 4)), balls, segments)
-    blocks = np.concatenate(
-        [
-            np.einsum("piju,pkju->pjik", balls, balls),
-            np.einsum("pij,pkj->pjik", segments, segments),
-        ],
-        axis=1,
-    )
-    square = rng.normal(size=(1, 30, 4, 4))
-    square = square + np.swapaxes(square, 2, 3)
-    wide = remainder.quadratic_range(square)
-    middle, radius = remainder.narrower_range(square, *wide, blocks)
+    blocks = [
+        np.einsum("piju,pkju->pjik", balls, balls),
+        np.einsum("pij,pkj->pjik", segments, segments),
+    ]
     directions = rng.normal(size=(40_000, 4))
     pulls = np.einsum("di,ijq->djq", directions, balls[0])
     pulls /= np.linalg.norm(pulls, axis=-1, keepdims=True)
     members = np.einsum("ijq,djq->di", balls[0], pulls)
     members += np.sign(directions @ segments[0]) @ segments[0].T
     assert np.all(members @ directions[0] <= found.support(directions[None, :1])[0])
+    return np.concatenate(blocks, axis=1), members
+
+
+def test_squares_over_a_sum_inside_the_ball_are_enclosed_more_closely():
+    rng = np.random.default_rng(15)
+    blocks, members = inner_sum(rng)
+    square = rng.normal(size=(1, 30, 4, 4))
+    square = square + np.swapaxes(square, 2, 3)
+    wide = remainder.quadratic_range(square)
+    middle, radius = remainder.narrower_range(square, *wide, blocks)
     values = np.einsum("di,kij,dj->kd", members, square[0], members)
     values = np.concatenate([values, np.zeros((30, 1))], axis=1)
     assert np.all(np.abs(values - middle[0, :, None]).max(axis=1) <= radius[0])
@@ -366,6 +374,25 @@ def test_forms_over_a_sum_inside_the_ball_are_enclosed_more_closely():
     # Nearer to what is reached than the ball.
     assert np.all(radius <= wide[1] * (1.0 + 1e-9))
     assert np.median(radius[0] / reached) < 0.93 * np.median(wide[1][0] / reached)
+
+
+def test_cubes_over_a_sum_inside_the_ball_are_enclosed_more_closely():
+    rng = np.random.default_rng(16)
+    blocks, members = inner_sum(rng)
+    slopes = rng.normal(size=(30, 4))
+    # Products of three slopes, two of them alike: what the cubic of a tilting body is like.
+    other = slopes + 0.3 * rng.normal(size=(30, 4))
+    cubes = np.einsum("ka,kb,kc->kabc", slopes, slopes, other)
+    cubes = sum(np.moveaxis(cubes, 3, axis) for axis in (1, 2, 3))[None]
+    wide = remainder.cubic_lines(cubes)
+    lines, left = remainder.narrower_lines(cubes, *wide, blocks)
+    values = np.einsum("di,dj,dk,nijk->nd", members, members, members, cubes[0], optimize=True)
+    inner = rng.random((1, len(members)))
+    for share in (np.ones_like(inner), inner):
+        off = np.abs(share**3 * values - share * (lines[0] @ members.T)).max(axis=1)
+        assert np.all(off <= left[0])
+    assert np.all(left <= wide[1])
+    assert np.mean(left < 0.95 * wide[1]) > 0.2
 
 
 def test_a_cube_follows_three_quarters_of_a_line():
