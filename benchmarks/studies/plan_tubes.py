@@ -6,9 +6,10 @@ search for the worst disturbance came to it in some of the episodes. For tasks w
 share that holds after planning with the room of the tube (Theorem 3). The law is that of (b).
 
     OMP_NUM_THREADS=1 python benchmarks/studies/plan_tubes.py [--tasks cartpole,examples/car.py]
-        [--plans 100] [--searched 10] [--json benchmarks/results/plan_tubes.json]
+        [--bounds 0.1,0.25] [--plans 100] [--searched 10]
+        [--json benchmarks/results/plan_tubes.json]
 
-With --json, rows of tasks that are not asked for stay in the file.
+With --json, rows of tasks and bounds that are not asked for stay in the file.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -111,16 +113,18 @@ def _with_room(task: Task, bound: float, episodes: int) -> dict[str, Any]:
     }
 
 
-def study(name: str, plans: int, searched: int) -> list[dict[str, Any]]:
-    """Return the rows of a task."""
+def study(
+    name: str, plans: int, searched: int, bounds: Sequence[float] = ()
+) -> list[dict[str, Any]]:
+    """Return the rows of a task, at its own bounds or at some."""
     task = find_task(name)
     assert isinstance(task, Task)
     seeds = episode_seeds(0, plans, _NAMESPACE)
     loop = loop_named(_POLICY, task, seeds)
     some = loop_named(_POLICY, task, seeds[:searched])
     tightened = min(searched, plans) if task.most_discs else 0
-    bounds = _BOUNDS.get(task.name, _OTHERS)
-    return [row_of(task, loop, some, bound, tightened) for bound in bounds]
+    asked = bounds or _BOUNDS.get(task.name, _OTHERS)
+    return [row_of(task, loop, some, bound, tightened) for bound in asked]
 
 
 def _printed(rows: list[dict[str, Any]]) -> Table:
@@ -147,24 +151,22 @@ def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--tasks", default="cartpole,examples/car.py,pvtol")
+    parser.add_argument("--bounds", default="")
     parser.add_argument("--plans", type=int, default=100)
     parser.add_argument("--searched", type=int, default=10)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     rows = []
     for name in options.tasks.split(","):
-        rows += study(name, options.plans, options.searched)
+        bounds = [float(bound) for bound in options.bounds.split(",") if bound]
+        rows += study(name, options.plans, options.searched, bounds)
         Console(width=120).print(_printed(rows))
     if options.json:
         kept = json.loads(options.json.read_text())["rows"] if options.json.is_file() else []
-        asked = {row["task"] for row in rows}
-        kept = [row for row in kept if row["task"] not in asked]
-        command = f"python benchmarks/studies/plan_tubes.py --plans {options.plans}"
-        write_atomic(
-            options.json,
-            json.dumps({"command": command, "policy": _POLICY, "rows": kept + rows}, indent=1)
-            + "\n",
-        )
+        asked = {(row["task"], row["bound"]) for row in rows}
+        rows += [row for row in kept if (row["task"], row["bound"]) not in asked]
+        rows.sort(key=lambda row: (row["task"], row["bound"]))
+        write_atomic(options.json, json.dumps({"policy": _POLICY, "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
