@@ -385,6 +385,8 @@ def test_flights_of_a_benchmark_keep_what_is_guaranteed_of_them():
             continue
         assert row["guaranteed_rate"] == 1.0
         assert row["guarantees_contradicted"] == 0
+        assert row["certified_violation_rate"] == 0.0
+        assert np.all(np.array(row["certified_tube"]) >= row["mean_tracking_error"])
         assert row["bound_over_worst"] >= 1.0
         # Larger than the bound of the linear error would be no use.
         assert row["bound_over_worst"] < 20.0
@@ -397,10 +399,13 @@ def test_a_guarantee_that_a_flight_contradicts_is_counted(monkeypatch):
         return {seed: Guaranteed(True, motion, np.zeros(task.steps + 1)) for seed in seeds}
 
     monkeypatch.setattr(columns, "guaranteed", wrong)
-    monkeypatch.setattr(Guaranteed, "error_bound", lambda self, nominal: 1e-3)
+    short = np.full(CartPoleSettings().steps + 1, 1e-3)
+    monkeypatch.setattr(Guaranteed, "error_bounds", lambda self, nominal: short)
     settings = replace(SETTINGS, policies=("lqr",), disturbances=("uniform",), bounds=(0.1,))
     (row,) = summarise(run_benchmark(settings))
     assert row["guarantees_contradicted"] == 5
+    assert row["certified_violation_rate"] == 1.0
+    assert row["certified_tube"] == [1e-3] * len(short)
 
 
 @pytest.mark.usefixtures("faked")
@@ -423,9 +428,10 @@ def test_worlds_of_agents_have_no_such_column():
 
 def test_a_bound_of_a_nominal_beside_the_motion_counts_the_way_between():
     one = Guaranteed(True, np.zeros((3, 2)), np.array([0.0, 1.0, 2.0]))
-    assert one.error_bound(np.array([[0.0, 0.0], [3.0, 4.0], [0.0, 1.0]])) == 6.0
-    assert one.error_bound(None) is None
-    assert replace(one, norm=np.array([0.0, 1.0, np.inf])).error_bound(np.zeros((3, 2))) is None
+    beside = np.array([[0.0, 0.0], [3.0, 4.0], [0.0, 1.0]])
+    np.testing.assert_array_equal(one.error_bounds(beside), [0.0, 6.0, 3.0])
+    assert one.error_bounds(None) is None
+    assert replace(one, norm=np.array([0.0, 1.0, np.inf])).error_bounds(np.zeros((3, 2))) is None
 
 
 def test_the_line_comes_first_and_in_one_piece(capsys):

@@ -28,17 +28,18 @@ class Guaranteed:
     motion: FloatArray
     norm: FloatArray
 
-    def error_bound(self, nominal: FloatArray | None) -> float | None:
+    def error_bounds(self, nominal: FloatArray | None) -> FloatArray | None:
         """Bound the distance from a nominal (N + 1, n), which need not be the motion itself.
 
         Returns:
-            None where there is no nominal, or no bound.
+            Shape (N + 1,); None where there is no nominal, or no bound.
         """
         if nominal is None or not np.isfinite(self.norm).all():
             return None
         # A policy plans from what it is shown, which is rounded; the nominal is from the start.
         apart = np.linalg.norm(nominal - self.motion, axis=-1)
-        return float((apart + self.norm).max())
+        bounds: FloatArray = apart + self.norm
+        return bounds
 
 
 def guaranteed(

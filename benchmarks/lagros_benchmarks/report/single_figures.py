@@ -20,7 +20,13 @@ from lagros_benchmarks.report.canvas import (
     save,
     styles,
 )
-from lagros_benchmarks.report.formats import by_condition, condition_title, figure_note, row_label
+from lagros_benchmarks.report.formats import (
+    by_condition,
+    condition_title,
+    figure_note,
+    percent,
+    row_label,
+)
 from lagros_benchmarks.run.experiment import Row
 
 if TYPE_CHECKING:
@@ -69,6 +75,11 @@ def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
         axes.plot(times, means[name], color=style.colour, linestyle=style.line, linewidth=2)
         last = means[name][np.isfinite(means[name])][-1]
         labels.append((float(last), row_label(row, longest=LONGEST_LABEL), style.colour))
+        if row["certified_tube"] is not None:
+            proved = curve(row["certified_tube"])
+            axes.plot(times, proved, color=style.colour, linestyle=(0, (1, 1)), linewidth=1)
+            name = row_label(row, longest=LONGEST_LABEL)
+            labels.append((float(proved[-1]), f"{name}: proved", style.colour))
     if tube is not None:
         axes.plot(times, tube, color=BLACK, linewidth=1.5)
         labels.append((width, "paper tube r(t)", BLACK))
@@ -81,6 +92,13 @@ def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
     episodes = rows[0]["episodes"]
     axes.set_title(f"{condition_title(rows[0])}, {episodes} episodes", loc="left", fontsize=10)
     text = "lines: mean; bands: 10th to 90th percentile; a fall keeps its largest error"
+    shares = [percent(row["guaranteed_rate"]) for row in drawn if row["certified_tube"] is not None]
+    if shares:
+        text += (
+            "\nproved: of every disturbance up to the bound, of "
+            + ", ".join(shares)
+            + " % of the plans"
+        )
     caption(figure, text + figure_note(rows))
     _label_ends(axes, labels)
     return save(figure, path)

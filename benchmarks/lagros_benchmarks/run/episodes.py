@@ -43,12 +43,13 @@ class EpisodeRecord(Keepable):
         effort_total: The same to the end of the episode, successful or not.
         left_paper_tube: ||x - x_d|| exceeded the paper tube, or the episode ended early, or it has
             no plan x_d; None for a task without a published tube.
-        left_certified_tube: None: no certified tube of ours is about a flight of this task
-            (`claims`).
+        left_certified_tube: Whether ||x - x_d|| exceeded what is proved of it at any control
+            instant; None where that was not asked, or nothing is.
         max_tracking_error: The largest ||x - x_d||; None without a plan.
         guaranteed: Whether it was proved, for every disturbance up to d_bar, that the episode is a
             strict success; None where that was not asked or no statement is about the policy.
         error_bound: What is proved of max_tracking_error; None where there is no tube.
+        error_bounds: Likewise of tracking_error.
         counters: What the policy counts, summed over the episode.
         timed_counters: Those of them that depend on the clock; left out of the comparison.
         error: The exception that ended the episode, which is then a failure; None if none did.
@@ -69,7 +70,7 @@ class EpisodeRecord(Keepable):
     effort: float
     effort_total: float
     left_paper_tube: bool | None
-    left_certified_tube: None
+    left_certified_tube: bool | None
     max_tracking_error: float | None
     counters: dict[str, int]
     error: str | None
@@ -79,6 +80,7 @@ class EpisodeRecord(Keepable):
     deadline_misses: int = field(compare=False)
     guaranteed: bool | None = None
     error_bound: float | None = None
+    error_bounds: FloatArray | None = field(default=None, compare=False, repr=False)
 
 
 def added_up(counters: Iterable[Mapping[str, int]]) -> dict[str, int]:

@@ -30,6 +30,8 @@ from lagros_policies.policy import BasePolicy
 
 _FORWARD_CALLS = 2000
 _CALM = Condition("none", 0.0)
+# Above what an error rounds, relative.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -195,7 +197,22 @@ def _with_guarantee(
     """Return a record with what is proved of its episode; None: it has no plan."""
     if proved is None:
         return replace(record, guaranteed=False)
-    return replace(record, guaranteed=proved.holds, error_bound=proved.error_bound(nominal))
+    bounds = proved.error_bounds(nominal)
+    return _bounded(replace(record, guaranteed=proved.holds), bounds)
+
+
+def _bounded(record: EpisodeRecord, bounds: FloatArray | None) -> EpisodeRecord:
+    """Return a record with what is proved of its error."""
+    if bounds is None:
+        return record
+    # The error is a rounded number, too.
+    left = bool(np.any(record.tracking_error > bounds * (1.0 + _ROUNDING)))
+    return replace(
+        record,
+        left_certified_tube=left,
+        error_bound=float(bounds.max()),
+        error_bounds=bounds,
+    )
 
 
 def _shared(
@@ -209,7 +226,7 @@ def _shared(
     }
     return {
         case: [
-            replace(one, guaranteed=its.guaranteed, error_bound=its.error_bound)
+            _bounded(replace(one, guaranteed=its.guaranteed), its.error_bounds)
             for one, its in zip(records, proved[case.policy, case.condition.bound], strict=True)
         ]
         for case, records in episodes.items()
