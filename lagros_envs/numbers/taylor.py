@@ -103,15 +103,23 @@ class Monomials:
                 found.append((place, i, j))
         found.sort()
         table = np.array(found)
+        # Layer by layer: the first product of every monomial, the second of those that have one.
+        counts = np.bincount(table[:, 0], minlength=self.count)
+        rank = np.arange(len(table)) - np.searchsorted(table[:, 0], table[:, 0])
+        order = np.argsort(-counts, kind="stable")
+        self.place = np.argsort(order)
+        table = table[np.lexsort((self.place[table[:, 0]], rank))]
         self.left, self.right = table[:, 1].copy(), table[:, 2].copy()
-        self.sums = np.searchsorted(table[:, 0], np.arange(self.count))
-
-        factor = [
-            math.prod(map(math.factorial, row)) / math.factorial(sum(row))
-            for row in self.exponents.tolist()
-        ]
-        self.weights = np.array(factor)
-        self.weights[self.mixed] = 1.0
+        ends = np.cumsum(np.bincount(rank))
+        self.layers = [slice(*pair) for pair in itertools.pairwise([0, *ends.tolist()])]
+        factors = [math.prod(map(math.factorial, row)) for row in self.exponents.tolist()]
+        totals = [math.factorial(sum(row)) for row in self.exponents.tolist()]
+        weights = np.array(factors) / np.array(totals)
+        weights[self.mixed] = 1.0
+        self.weights = np.zeros((len(self.starts), self.count))
+        self.weights[
+            np.searchsorted(self.starts, range(self.count), side="right") - 1, range(self.count)
+        ] = weights
         alone = [place for place, (kind, _) in enumerate(self.kinds) if kind == DEGREE + 1]
         self.lone_kind = alone[0] if alone else None
 
@@ -166,9 +174,7 @@ class TaylorModel:
         """Bounds of each kind of monomials over the domain, shape (kinds, ...)."""
         if self._norms is None:
             kept = self.monomials
-            squares = self.parts * self.parts
-            squares *= kept.weights.reshape(-1, *[1] * (self.parts.ndim - 1))
-            norms = np.sqrt(np.add.reduceat(squares, kept.starts, axis=0))
+            norms = np.sqrt(_combined(kept.weights, self.parts * self.parts))
             if kept.lone_kind is not None:
                 norms[kept.lone_kind] = np.abs(self.parts[kept.first[1]]).sum(axis=0)
             self._norms = norms * _WIDER + 1e-150
@@ -221,11 +227,14 @@ class TaylorModel:
             rest = (self.rest * factor + _ROUNDING * size) * _WIDER
             return TaylorModel(self.monomials, self.parts * other, rest, size)
         kept, one, two = self.monomials, self, other
-        products = one.parts[kept.left]
-        products *= two.parts[kept.right]
-        parts = np.add.reduceat(products, kept.sums, axis=0)
+        products = one.parts.take(kept.left, axis=0)
+        products *= two.parts.take(kept.right, axis=0)
+        total = products[kept.layers[0]]
+        for layer in kept.layers[1:]:
+            total[: layer.stop - layer.start] += products[layer]
+        parts = total.take(kept.place, axis=0)
         sizes, others = one.norms, two.norms
-        cut = (sizes * np.tensordot(kept.cuts, others, axes=1)).sum(axis=0)
+        cut = (sizes * _combined(kept.cuts, others)).sum(axis=0)
         first, second = sizes.sum(axis=0), others.sum(axis=0)
         rest = one.rest * (second + two.rest) + first * two.rest
         rest = (rest + cut + _PRODUCT_ERROR * (one.size * two.size)) * _WIDER
@@ -324,3 +333,9 @@ class TaylorModel:
         size = self.size + np.abs(constant)
         rest = (self.rest + _ROUNDING * size) * _WIDER
         return TaylorModel(self.monomials, moved, rest, size)
+
+
+def _combined(matrix: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return sums of rows (k, ...) by the weights of a matrix (j, k), shape (j, ...)."""
+    flat = rows.reshape(len(rows), -1)
+    return (matrix @ flat).reshape(-1, *rows.shape[1:])
