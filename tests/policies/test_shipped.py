@@ -21,6 +21,7 @@ from lagros_policies.contraction import (
 from lagros_policies.learning.dataset import ExpertDataSettings, generate
 from lagros_policies.learning.features import seen
 from lagros_policies.learning.networks import Mlp, read_safetensors
+from lagros_policies.learning.replanned import generate_replanned
 from lagros_policies.learning.train import learning_error
 from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.cartpole.expert import CartPoleExpert
@@ -34,7 +35,7 @@ def needs(*names):
 
 
 METRIC = "cartpole_metric.json"
-POLICIES = ("lagros", "learned")
+POLICIES = ("lagros", "learned", "learned-mpc")
 
 
 @pytest.fixture(scope="module")
@@ -243,3 +244,24 @@ def test_recorded_learning_error_of_the_learned_policy_is_that_of_fresh_episodes
     error, stated = learning_error(network, features, labels), record("learned")["learning_error"]
     assert error.mean < 3.0 * stated["mean"]
     assert error.mean < 0.05 * np.abs(labels).mean()
+
+
+@needs(METRIC, "cartpole_learned-mpc.safetensors", "cartpole_learned-mpc.json")
+def test_recorded_learning_error_of_the_learned_mpc_is_that_of_fresh_episodes(shipped, tmp_path):
+    network = Mlp.load(PRETRAINED / "cartpole_learned-mpc.safetensors")
+    few = ExpertDataSettings(plans=40, samples=2000, shards=2, seed=31_337)
+    # Where u* flies, and where the network comes to by itself.
+    parts = [
+        generate_replanned(tmp_path / name, shipped, few, network=flier)
+        for name, flier in (("tube", None), ("own", network))
+    ]
+    observation = np.concatenate([part.observation for part in parts])
+    features, side = seen(CartPoleView(), observation.astype(np.float32))
+    labels = (np.concatenate([part.control for part in parts]) * side).astype(np.float32)
+    error, stated = (
+        learning_error(network, features, labels),
+        record("learned-mpc")["learning_error"],
+    )
+    assert error.mean < 2.0 * stated["mean"]
+    assert error.mean > 0.3 * stated["mean"]
+    assert error.mean < 0.1 * np.abs(labels).mean()
