@@ -399,7 +399,7 @@ def spacecraft_calls(body: Any) -> Iterator[tuple[Callable[..., Any], Callable[[
     axis, gain, one = lagrangian.SlidingAxis(), AxisGain.of_rate(2.0), np.ones(1)
     planned = world_tube.Planned(one, one, one, np.zeros((1, 2)), 1.0)
     state, wrench = np.zeros(6), np.zeros(3)
-    certificate = {"disturbance_bound": 0.4, "learning_error": 0.0, "paper_radius": 1.0}
+    certificate = {"disturbance_bound": 0.4, "paper_radius": 1.0}
     for function, ask in {
         thrusters.allocate: lambda f: f(body, wrench),
         thrusters.allocation_matrix: lambda f: f(body),
