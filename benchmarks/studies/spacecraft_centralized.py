@@ -5,7 +5,7 @@ are per agent, with Wilson intervals that take agents for independent, which tho
 not quite. A world without a plan counts with all its agents as failures, and is listed.
 
     python benchmarks/studies/spacecraft_centralized.py [--worlds 20] [--bound 0.2,0.6,1.0]
-        [--rate 2.0] [--seed 0] [--json FILE]
+        [--rate 2.0] [--law gain] [--seed 0] [--json FILE]
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ def fly(
     return measures, memory[0]
 
 
-def study(worlds: int, bounds: list[float], rate: float, seed: int) -> list[dict[str, Any]]:
+def study(
+    worlds: int, bounds: list[float], rate: float, seed: int, law: str
+) -> list[dict[str, Any]]:
     """Fly the same worlds under every bound and return one row for each bound."""
     seeds = episode_seeds(seed, worlds, EVALUATION)
     rows = []
@@ -58,7 +60,7 @@ def study(worlds: int, bounds: list[float], rate: float, seed: int) -> list[dict
             AGENTS, PRESET, disturbance="uniform", disturbance_bound=bound
         )
         policy = CentralizedPolicy(
-            env.settings, PRESET, AGENTS, disturbance_bound=bound, contraction_rate=rate
+            env.settings, PRESET, AGENTS, disturbance_bound=bound, contraction_rate=rate, law=law
         )
         flown = [fly(env, policy, one) for one in seeds]
         rows.append({**_row(policy, seeds, flown), "bound": bound, "contraction_rate": rate})
@@ -161,11 +163,12 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=20)
     parser.add_argument("--bound", default="0.2,0.6,1.0", help="disturbance bounds, by commas")
     parser.add_argument("--rate", type=float, default=2.0, help="contraction rate of u* [1/s]")
+    parser.add_argument("--law", default="gain", help="how u* answers an error")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the rows there")
     options = parser.parse_args()
     bounds = [float(part) for part in options.bound.split(",")]
-    rows = study(options.worlds, bounds, options.rate, options.seed)
+    rows = study(options.worlds, bounds, options.rate, options.seed, options.law)
     show(rows)
     if options.json is not None:
         write_atomic(options.json, json.dumps(rows, indent=1) + "\n")

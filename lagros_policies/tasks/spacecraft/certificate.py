@@ -109,7 +109,7 @@ def spacecraft_certificate(
         chi=chi,
         nu=nu,
         b_bar=gain,
-        epsilon_l=0.0,
+        epsilon_l=0.0 if flown else None,
         d_bar=disturbance_bound,
         channels="all",
         basis="1 (W_bar is constant); the state is [x, y, heading, vx, vy, spin]",
