@@ -38,6 +38,8 @@ class Seen(NamedTuple):
 
 
 Vector = Sequence[Any]
+_PLACES = 3  # where features are looked at for being affine
+_STILL = 1e-8  # what differences leave of slopes that are zero
 _STEP = 1e-4  # of central differences, in units of the direction
 _SMALL = 1e-3  # lengths below are none [m, m/s]
 _MOTION = (
@@ -138,21 +140,39 @@ class Stated:
 
     Args:
         task: The task.
+
+    Attributes:
+        affine: How many of the features, the first ones, are affine in the state at a few places,
+            while the others do not move with it there.
     """
 
     alike: Alike | None = None
-    affine = 0
 
     def __init__(self, task: Task) -> None:
         """Count what it says."""
         self.task = task
         count = len(self([1.0] * task.layout.size, functions).features)
         self.names = tuple(f"feature {index}" for index in range(count))
+        self.affine = _affine(self, task)
 
     def __call__(self, observation: Sequence[Any], functions: Any) -> Seen:
         """See an observation, given by its components."""
         assert self.task.features is not None
         return Seen(self.task.features(observation, functions))
+
+
+def _affine(see: See, task: Task) -> int:
+    """Return how many of the first features are affine in the state, the others not moved by it."""
+    rng, n = np.random.default_rng(0), task.system.state_dim
+    rows = np.tile(rng.uniform(0.1, 1.0, task.layout.size), (n, 1))
+    ways, slopes = np.zeros_like(rows), []
+    ways[:, task.layout.state] = np.eye(n)
+    for _ in range(_PLACES):
+        rows[:, task.layout.state] = rng.standard_normal(n)
+        slopes.append(moved(see, rows, ways))
+    first = slopes[0]
+    count = int(np.flatnonzero(np.any(np.abs(first) > _STILL, axis=0)).max(initial=-1)) + 1
+    return count if np.allclose(slopes, first, rtol=1e-6, atol=_STILL) else 0
 
 
 class Usual:

@@ -120,6 +120,30 @@ def test_a_task_may_say_itself_what_is_seen():
     row = np.arange(Own().layout.size, dtype=np.float32)
     np.testing.assert_allclose(seen(view, row)[0], [0.0, 4.0])
     assert view(row.tolist(), functions).signs == ()
+    assert view.affine == 0  # there is a sine
+
+
+def test_features_of_a_user_are_found_to_be_affine_or_not():
+    layout = Slide().layout
+    time = layout.time
+
+    @dataclass(frozen=True)
+    class Straight(Slide):
+        def features(self, observation, functions):
+            sign = functions.where(observation[layout.goal.start] < 0.0, -1.0, 1.0)
+            return sign * observation[0], 2.0 * observation[1] - observation[0], observation[time]
+
+    @dataclass(frozen=True)
+    class Mixed(Slide):
+        def features(self, observation, functions):
+            return observation[0], observation[0] * observation[1], observation[time]
+
+    @dataclass(frozen=True)
+    class Late(Slide):
+        def features(self, observation, functions):
+            return observation[0], observation[time], observation[1]
+
+    assert [view_of(one()).affine for one in (Straight, Mixed, Late)] == [2, 0, 3]
 
 
 @pytest.mark.parametrize("task", [PvtolSettings(), Slide()], ids=lambda task: task.name)
