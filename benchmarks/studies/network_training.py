@@ -53,7 +53,7 @@ from lagros_policies.proof.plan_tube import plan_tubes
 _NAMESPACE = 53
 _KINDS = ("uniform", "constant", "gust", "switching")
 # Each form is tried until less than this share of its episodes is proved.
-_BOUNDS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3)
+_BOUNDS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.25, 0.3)
 _ENOUGH = 0.9
 _FORMS = {
     "mlp": (False, 0.0),
