@@ -15,7 +15,7 @@ import numpy as np
 
 from lagros_envs.aliases import moved_names
 from lagros_envs.arrays import FloatArray, IntArray
-from lagros_envs.checks import shown, suggestion
+from lagros_envs.checks import check_name
 from lagros_envs.dynamics import linearise_hold
 from lagros_envs.task import Feedback, Task
 from lagros_policies.baselines import bryson_weights, regulator_weights
@@ -179,13 +179,10 @@ class Expert:
         law: str | None = None,
         weights: Feedback | None = None,
     ) -> None:
-        self.task = task
-        self.law_name = law or (SHIPPED_LAW if preference is None else "tuned")
-        if self.law_name not in LAWS:
-            raise ValueError(
-                f"law={shown(law)} is not known; use one of {', '.join(LAWS)}."
-                f"{suggestion(law, LAWS)}"
-            )
+        if law is None:
+            law = SHIPPED_LAW if preference is None else "tuned"
+        check_name("law", law, LAWS)
+        self.task, self.law_name = task, law
         if preference is not None and self.law_name != "tuned":
             raise ValueError(f"law={law!r} prefers nothing: leave out preference, or law")
         self._metric, self._preference = metric, preference

@@ -12,10 +12,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
-from lagros_envs.checks import check_above, check_not_negative, check_whole, shown
+from lagros_envs.checks import check_above, check_name, check_not_negative, check_whole, shown
 from lagros_envs.task import Task
 from lagros_policies.contraction import ContractionMetric, load_metric
-from lagros_policies.expert import WITHIN_METRIC, Expert, TrackedPlans
+from lagros_policies.expert import LAWS, WITHIN_METRIC, Expert, TrackedPlans
 from lagros_policies.observed import observed_rows
 from lagros_policies.planning import Trajectory
 from lagros_policies.policy import BasePolicy, PolicyState, row_memories
@@ -106,9 +106,15 @@ class TubeMpcPolicy(BasePolicy):
             check_whole("replan_every", replan_every)
         deadline = task.control_period if deadline is None else deadline
         check_above("deadline", deadline, 0)
+        if law is not None:
+            check_name("law", law, LAWS)
         if metric is None:
             if law in WITHIN_METRIC:
                 check_own_metric(task, allow_other_settings)
+        elif law is not None and law not in WITHIN_METRIC:
+            raise ValueError(
+                f"metric: the law {law!r} is in none of the task; leave one of both out"
+            )
         elif isinstance(metric, str | Path):
             metric = load_metric(metric, task.system.state_dim)
         elif not all(hasattr(metric, name) for name in ("contraction_rate", "condition_bound")):

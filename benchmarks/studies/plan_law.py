@@ -65,7 +65,7 @@ _KINDS = ("uniform", "constant", "gust", "switching")
 _SEARCHED, _PROVED = 0.4, (2.0 / 15.0, 1.0 / 3.0)
 _SMALL = 1e-3  # d_bar at which a flight is as good as linear
 _CONTROL_SHARES = (1.0 / 16.0, 0.25, 4.0, 16.0)
-_DESIGNED = 30  # plans that `joint` is designed on
+_DESIGNED = 20  # plans that `joint` is designed on
 _EARLY = (0.0, 2.0, 4.0, 6.0)  # logarithm of R at the start in units of R
 
 
@@ -80,7 +80,7 @@ class JointExpert(Expert):
             2.0 * own.rate,
             own.state_weights,
             10.0 * min(own.control_weights),
-            getattr(metric, "basis", None) or CONSTANT,
+            getattr(metric, "phi", CONSTANT),
         )
         n, m = task.system.state_dim, task.system.control_dim
         self._joint = design_sampled(

@@ -145,7 +145,7 @@ class AdaptiveTubeMpcPolicy(TubeMpcPolicy):
         metric: ContractionMetric | str | Path | None = None,
         **planning: Any,
     ) -> None:
-        super().__init__(settings, metric, law="tuned", **planning)
+        super().__init__(settings, metric, **{"law": "tuned", **planning})
         self.name = type(self).name
         law = self.expert.law
         # A function of the module, so that the policy can be pickled.
