@@ -276,7 +276,8 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             points = [(r["worst"]["flown_median"], factor * r["uniform"][column]) for r in line]
             axis.plot(*zip(*points, strict=True), marker=".", label=f"{prefix} ...")
         for row in rows:
-            if not row["law"].startswith("R "):
+            # The projection that never acts lies on the gain.
+            if not row["law"].startswith("R ") and row["law"] != "projected":
                 place = row["worst"]["flown_median"], factor * row["uniform"][column]
                 axis.plot(*place, marker="o", linestyle="none", color="black")
                 axis.annotate(
@@ -285,6 +286,9 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         axis.set_xlabel("largest error found per unit of d̄, median plan")
         axis.set_ylabel(label)
         axis.set_xscale("log")
+        axis.set_xticks(ticks := (5, 7, 10, 15, 20), [str(tick) for tick in ticks], minor=False)
+        axis.set_xticks((), minor=True)
+        axis.margins(x=0.12)
     axes[0].legend()
     figure.savefig(path, dpi=150)
 
