@@ -49,12 +49,13 @@ def aimed(system, period, plan, gains, directions, bound, instants, pushes=None)
     linearise along, this is a step of gradient ascent, as long as it can be.
     """
     states, controls = plan
-    if pushes is None:
-        pushes = np.zeros((len(directions), *states[1:].shape))
-    error = flown(system, period, plan, gains, pushes)[:, :-1]
+    along = np.zeros((1, *states[1:].shape)) if pushes is None else pushes
+    error = flown(system, period, plan, gains, along)[:, :-1]
     control = controls + np.einsum("kmn,qkn->qkm", gains, error)
-    by_state, by_push = slopes(system, period, states[:-1] + error, control, gains, pushes)
-    found = np.zeros(pushes.shape)
+    by_state, by_push = slopes(system, period, states[:-1] + error, control, gains, along)
+    shape = len(directions), *by_state.shape[1:]
+    by_state, by_push = np.broadcast_to(by_state, shape), np.broadcast_to(by_push, shape)
+    found = np.zeros(shape[:3])
     pull = np.zeros(directions.shape)
     for step in range(len(gains) - 1, -1, -1):
         pull = np.where((np.asarray(instants) == step + 1)[:, None], directions, pull)
