@@ -507,6 +507,7 @@ GENERAL = {
     ),
     *("proof.guarantee.nominal_between", "proof.plan_tube.plan_tubes", "proof.plan_tube.curved"),
     *("proof.between.holds", "proof.between.errors_between", "proof.hold_error.HoldOfErrors"),
+    *("contraction.sampled.push_slope", "contraction.sampled.design_sampled"),
     *("contraction.ellipsoid.TubeControl", "tasks.cartpole.box.balance"),
     *(
         "remarks.stochastic.noisy_hold_step",
