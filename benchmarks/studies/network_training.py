@@ -162,7 +162,8 @@ class Episodes:
 def proved(task: Task, network: Mlp, scenarios: Sequence[Scenario]) -> list[dict[str, Any]]:
     """Return for each bound, the shares of episodes with a tube and with a guarantee."""
     flight = network_flight(task, network, scenarios)
-    goals, rows = np.array([scenario.goal for scenario in scenarios]), []
+    goals = np.array([scenario.goal for scenario in scenarios])
+    rows: list[dict[str, Any]] = []
     discs = np.zeros((len(scenarios), 0, 3))
     for bound in _BOUNDS:
         begun = perf_counter()
