@@ -254,7 +254,7 @@ class Sway(Task):
 
 def test_a_task_of_ones_own_that_has_changed_does_not_go_on_with_a_run(tmp_path, monkeypatch):
     """Whatever of it has changed; what it looks like, and how it is called, may."""
-    monkeypatch.setattr("lagros_benchmarks.run.reproduce._Making.run", lambda making: None)
+    monkeypatch.setattr("lagros_benchmarks.run.making.Making.run", lambda making: None)
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "sway.py"
     path.write_text(SWAY)

@@ -139,7 +139,9 @@ def test_scores_of_the_cartpole_are_those_of_its_flights() -> None:
     more = calibration.single_scores(CartPoleSettings(), "lagros", 12, bound=3.0)
     assert np.all(more.values["tube"] > tube)
     still = calibration.single_scores(CartPoleSettings(), "tube-mpc", 4, kind="none", bound=0.0)
-    assert still.values["learning_error"].max() < 1e-3
+    assert still.values["tube"].max() < 1e-3
+    # What imitates nothing has no learning error.
+    assert set(scores.values) - set(still.values) == {"learning_error"}
 
 
 def test_statements_need_enough_episodes_for_the_level() -> None:

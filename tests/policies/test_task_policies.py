@@ -134,13 +134,16 @@ def test_another_system_needs_another_metric(metrics, tmp_path):
 
     task = type("Kept", (Slide,), {"weights": tmp_path})
     save_metric(metrics["slide"], tmp_path / "slide_metric.json")
-    assert TubeMpcPolicy(task()).settings.name == "slide"
+    assert TubeMpcPolicy(task(), law="least-norm").settings.name == "slide"
     heavy = replace(task(), system=replace(task().system, mass=2.0))
     with pytest.raises(
         ValueError, match=r"system\.mass=2\.0: the shipped metric was made for 1\.0"
     ):
-        TubeMpcPolicy(heavy)
-    assert TubeMpcPolicy(heavy, allow_other_settings=True).settings.system.mass == 2.0
+        TubeMpcPolicy(heavy, law="least-norm")
+    allowed = TubeMpcPolicy(heavy, law="least-norm", allow_other_settings=True)
+    assert allowed.settings.system.mass == 2.0
+    # The law along a plan has its metric from the plan, of whatever system that is.
+    assert TubeMpcPolicy(heavy).settings.system.mass == 2.0
 
 
 # The regulator
