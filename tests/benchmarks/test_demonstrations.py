@@ -204,4 +204,4 @@ def test_the_spacecraft_repeats_too_and_its_plan_ends_at_the_goal():
     push = episode.infos["nominal_control"][:-1, :2]
     moved = states[:-1, :2] + 0.1 * states[:-1, 3:5] + 0.005 * push
     np.testing.assert_allclose(moved, states[1:, :2], atol=1e-5)
-    assert json.loads(json.dumps(record))["metric"]["plane"]["alpha"] == 2.0
+    assert json.loads(json.dumps(record))["metric"]["plane"]["alpha"] == pytest.approx(2.0)
