@@ -252,7 +252,8 @@ def test_where_a_tube_does_not_close_the_others_do():
     assert found.closed.tolist() == [True, False, True]
     assert np.isinf(found.outputs[1, -1]).all()
     assert np.isinf(found.between[1, -1]).all()
-    assert np.array_equal(found.outputs[0], found.outputs[2])
+    # Their places in a batch may change how their sums are rounded.
+    np.testing.assert_allclose(found.outputs[0], found.outputs[2], rtol=1e-9)
 
 
 def test_what_limits_take_of_the_control_counts():
