@@ -34,6 +34,7 @@ _ALONG: dict[str, Callable[[Task], Feedback]] = {
     "projected": lambda task: bryson_weights(task),
     "half-rate": lambda task: _at_rate(bryson_weights(task), 0.5),
     "double-rate": lambda task: _at_rate(bryson_weights(task), 2.0),
+    "no-rate": lambda task: _at_rate(bryson_weights(task), 0.0),
     "lqr": lambda task: regulator_weights(task),
 }
 # The laws within a contraction metric of the task.
@@ -151,7 +152,8 @@ class Expert:
     - "gain": u_d + K e, with the gain of the metric along the plan; shipped.
     - "projected": the same, moved to the nearest control that contracts in that metric.
     - "half-rate", "double-rate": "gain" of the metric with half and twice the rate.
-    - "lqr": a plain regulator along the plan, of no metric.
+    - "no-rate": the weights of "gain" in a plain regulator: what a metric does not add.
+    - "lqr": a plain regulator along the plan, of no metric, with the weights of `LqrPolicy`.
 
     Laws within the metric that CV-STEM has designed for the task:
 

@@ -44,7 +44,10 @@ _SINGLE = {
 _OTHER_LAWS = {
     **{
         f"tube-mpc:{law}": law
-        for law in ("gain", "projected", "half-rate", "double-rate", "least-norm", "tuned")
+        for law in (
+            *("gain", "projected", "half-rate", "double-rate", "no-rate"),
+            *("least-norm", "tuned"),
+        )
     },
     "lqr-plan": "lqr",
 }

@@ -132,7 +132,7 @@ def planned(request):
     return task, np.stack([one for one, _ in found]), np.stack([two for _, two in found])
 
 
-@pytest.mark.parametrize("law", ["gain", "projected", "half-rate", "double-rate", "lqr"])
+@pytest.mark.parametrize("law", ["gain", "projected", "half-rate", "double-rate", "no-rate", "lqr"])
 def test_laws_along_a_plan_need_no_metric_of_the_task(planned, law):
     task, states, controls = planned
     expert = Expert(task, law=law)
@@ -200,6 +200,24 @@ def test_half_and_double_rate_are_the_same_program_at_other_rates(planned):
         for law in ("half-rate", "double-rate")
     )
     assert slow < fast
+
+
+def test_without_a_rate_the_law_is_the_plain_regulator_of_its_weights(planned):
+    task, states, controls = planned
+    own, period = Expert(task).feedback, task.control_period
+    flat = replace(own, early_state=(), early_control=())
+    found = Expert(task, law="no-rate", weights=replace(flat, rate=0.0)).track(states, controls)
+    assert Expert(task, law="no-rate").feedback == replace(own, rate=0.0)
+    _, by_state, by_control = linearise_hold(task.system, states[:, :-1], controls, period)
+    q, r = np.diag(own.state_weights), np.diag(own.control_weights)
+    for plan in range(len(states)):
+        value = 10.0 * q
+        for k in reversed(range(controls.shape[1])):
+            a, b = by_state[plan, k], by_control[plan, k]
+            gain = -np.linalg.solve(r + b.T @ value @ b, b.T @ value @ a)
+            # Joseph's form, another than that of the recursion.
+            value = q + gain.T @ r @ gain + (a + b @ gain).T @ value @ (a + b @ gain)
+            assert found.feedback[plan, k] == pytest.approx(gain, rel=1e-6, abs=1e-9)
 
 
 def test_the_nearest_point_of_one_control_is_that_of_the_general_ellipsoid():
