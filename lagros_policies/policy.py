@@ -41,16 +41,8 @@ _SINGLE = {
     "residual": "lagros_policies.residual:ResidualPolicy",
 }
 # Other laws around the plan of "tube-mpc", to be held against the shipped one.
-_OTHER_LAWS = {
-    **{
-        f"tube-mpc:{law}": law
-        for law in (
-            *("gain", "projected", "half-rate", "double-rate", "no-rate"),
-            *("least-norm", "tuned"),
-        )
-    },
-    "lqr-plan": "lqr",
-}
+_LAWS = "gain", "projected", "half-rate", "double-rate", "no-rate", "least-norm", "tuned"
+_OTHER_LAWS = {**{f"tube-mpc:{law}": law for law in _LAWS}, "lqr-plan": "lqr"}
 _SINGLE |= dict.fromkeys(_OTHER_LAWS, _SINGLE["tube-mpc"])
 NAMES = tuple(_SINGLE)
 moved_names(__name__)

@@ -3,8 +3,9 @@
 Laws and weights are held against each other around the same plans, under the same disturbances:
 
 - every law of `lagros_policies.expert.LAWS`: the gain of the metric along the plan (shipped), the
-  same projected onto the contracting set, at half and twice the rate, a plain regulator of the same
-  plan, and within the task's CV-STEM metric the least-norm u* and the preference tuned before;
+  same projected onto the contracting set, at half and twice the rate, with its weights in a plain
+  regulator (no rate, hence no metric), a plain regulator with those of `lqr`, and within the task's
+  CV-STEM metric the least-norm u* and the preference tuned before;
 - `joint`: one metric and one gain for all plans, functions of x_d, from the same condition imposed
   jointly over samples (`contraction/sampled.py`), at twice the rate;
 - the shipped weights with another control weight R, and with another R at the start of an episode:
@@ -262,12 +263,15 @@ def show(rows: list[dict[str, Any]]) -> None:
             )
 
 
-def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draw effort and exits over the worst error of each row."""
+def draw(rows: list[dict[str, Any]], path: Path, unit: str) -> None:
+    """Draw effort, in a unit or "", and exits over the worst error of each row."""
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, 2, figsize=(9.0, 3.6), constrained_layout=True)
-    columns = (("effort", 1.0, "effort"), ("left", 100.0, "left the paper's tube [%]"))
+    figure, axes = plt.subplots(1, 2, figsize=(9.6, 3.6), constrained_layout=True)
+    columns = (
+        ("effort", 1.0, f"effort [{unit}s]" if unit else "effort"),
+        ("left", 100.0, "left the paper's tube [%]"),
+    )
     for axis, (column, factor, label) in zip(axes, columns, strict=True):
         for prefix in ("R x", "R begins"):
             line = [row for row in rows if row["law"].startswith(prefix)]
@@ -275,13 +279,13 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             line.sort(key=lambda row: row["worst"]["flown_median"])
             points = [(r["worst"]["flown_median"], factor * r["uniform"][column]) for r in line]
             axis.plot(*zip(*points, strict=True), marker=".", label=f"{prefix} ...")
+        marks = iter("os^vDPX*")
         for row in rows:
             # The projection that never acts lies on the gain.
             if not row["law"].startswith("R ") and row["law"] != "projected":
                 place = row["worst"]["flown_median"], factor * row["uniform"][column]
-                axis.plot(*place, marker="o", linestyle="none", color="black")
-                axis.annotate(
-                    row["law"], place, fontsize=7, xytext=(4, 3), textcoords="offset points"
+                axis.plot(
+                    *place, marker=next(marks), linestyle="none", color="black", label=row["law"]
                 )
         axis.set_xlabel("largest error found per unit of d̄, median plan")
         axis.set_ylabel(label)
@@ -289,7 +293,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         axis.set_xticks(ticks := (5, 7, 10, 15, 20), [str(tick) for tick in ticks], minor=False)
         axis.set_xticks((), minor=True)
         axis.margins(x=0.12)
-    axes[0].legend()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
     figure.savefig(path, dpi=150)
 
 
@@ -317,7 +321,7 @@ def main() -> None:
     if options.json:
         write_json(options.json, rows)
     if options.figure:
-        draw(rows, options.figure)
+        draw(rows, options.figure, task.squared_unit)
 
 
 if __name__ == "__main__":
