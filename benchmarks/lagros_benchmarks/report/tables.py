@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from lagros_benchmarks.report.formats import Column
 
 
+_WIDTH = 80  # of a terminal
+
+
 class _Texts(Protocol):
     """What a module that words the tables of a task has."""
 
@@ -84,7 +87,8 @@ def plain_table(
         box=box.SIMPLE_HEAD,
         pad_edge=False,
         show_edge=framed,
-        collapse_padding=not framed,
+        # Columns come nearer to each other before one of them is cut.
+        collapse_padding=not framed or _width(headings, contents) > _WIDTH,
     )
     for index, heading in enumerate(headings):
         table.add_column(heading, justify="right" if index else "left", no_wrap=True)
@@ -92,6 +96,15 @@ def plain_table(
         # As text: the name of a file may hold what rich takes for markup.
         table.add_row(*map(Text, line))
     return table
+
+
+def _width(headings: Sequence[str], contents: Sequence[Sequence[str]]) -> int:
+    """Return how wide a table is with a space on both sides of each cell and a gap between."""
+    cells = [
+        [part for heading in column[:1] for part in heading.splitlines()] + list(column[1:])
+        for column in zip(headings, *contents, strict=True)
+    ]
+    return sum(2 + max(map(len, column)) for column in cells) + len(cells) - 1
 
 
 def error_lines(rows: Sequence[Row], most: int = 5) -> Iterator[str]:
