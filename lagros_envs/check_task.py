@@ -66,7 +66,7 @@ def check_task(task: Any) -> None:
 
 
 def _check_names(task: Task) -> None:
-    for name, pattern, example in (("name", _NAME, "car"), ("title", _TITLE, "Car")):
+    for name, pattern, example in (("name", _NAME, "puck"), ("title", _TITLE, "Puck")):
         value = getattr(task, name, None)
         if not isinstance(value, str) or not re.fullmatch(pattern, value):
             raise ValueError(

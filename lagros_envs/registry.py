@@ -67,8 +67,8 @@ def find_task(text: str) -> Described:
 
     Args:
         text: A name; one in the entry-point group `lagros.tasks` of an installed package;
-            "module:attribute"; or the path of a file, "./car.py", or of one with an attribute,
-            "./car.py:Car". The file is run. In it the task is `task`, or else the only task.
+            "module:attribute"; or the path of a file, "./puck.py", or of one with an attribute,
+            "./puck.py:Puck". The file is run. In it the task is `task`, or else the only task.
 
     Raises:
         ValueError: There is no such task, or something is wrong with it.
@@ -101,7 +101,7 @@ def _found(text: str) -> Described:
     names = (*task_names(), *entry_points(group=ENTRY_POINTS).names)
     raise ValueError(
         f"unknown task {shown(text)}.{suggestion(text, names)} Valid: {', '.join(names)}; "
-        'the path of a file with a task, such as "./car.py"; or "module:attribute"'
+        'the path of a file with a task, such as "./puck.py"; or "module:attribute"'
     )
 
 
@@ -174,7 +174,7 @@ def _loaded(text: str) -> Any:
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(
             f"{text}: {error}. A module is looked for on Python's path; name a file by its path, "
-            'such as "./car.py"'
+            'such as "./puck.py"'
         ) from error
     except (Exception, SystemExit) as error:
         raise ValueError(f"{text}: {name} raises {type(error).__name__}: {error}") from error

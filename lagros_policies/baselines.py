@@ -60,7 +60,7 @@ class LqrPolicy(BasePolicy):
     """Linear-quadratic regulator about the goal: u = u_f - K (x - x_f).
 
     K minimises the infinite sum of x'Qx + u'Ru for the exact linearisation, at the goal, of one
-    control step with zero-order hold; u_f holds the goal. Where no control holds it, as for a car
+    control step with zero-order hold; u_f holds the goal. Where no control holds it, as for a body
     that passes it at speed, the regulator follows the motion under the reference control that is at
     the goal at the time limit. It knows of no discs.
 

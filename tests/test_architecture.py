@@ -98,16 +98,23 @@ def test_general_code_does_not_import_a_task():
 def test_a_task_is_named_in_its_folder_only(path):
     if NAMED.search(place(path)):
         return
-    text = path.read_text(encoding="utf-8").lower()
-    names = {
-        folder.name for folder in (ROOT / "lagros_envs" / "tasks").iterdir() if folder.is_dir()
-    }
-    found = {
-        name
-        for name in names - {"__pycache__"}
-        if re.search(rf"{name}|{name[:4]}-?{name[4:]}", text)
-    }
-    assert not found
+    text = path.read_text(encoding="utf-8")
+    assert not [name for name in TASKS if naming(name).search(text)]
+
+
+@pytest.mark.parametrize(
+    "text", ["a car", "car_metric.json", "CarSettings", "./car.py", "tasks.car"]
+)
+def test_a_short_name_is_found_as_a_word(text):
+    assert naming("car").search(text)
+    assert not naming("car").search("carry scarce Carefully")
+
+
+def naming(name):
+    """Return what finds a task's name in code: a short one as a word, or as one of CamelCase."""
+    if len(name) > 4:
+        return re.compile(rf"{name}|{name[:4]}-?{name[4:]}", re.IGNORECASE)
+    return re.compile(rf"(?<![a-zA-Z]){name}(?![a-z])|{name.title()}(?![a-z])")
 
 
 @pytest.mark.parametrize("path", FILES, ids=place)

@@ -5,7 +5,7 @@ guarantees everything (goal, fall, discs, bounds of the control), its largest wi
 search for the worst disturbance came to it in some of the episodes. For tasks with discs also the
 share that holds after planning with the room of the tube (Theorem 3). The law is that of (b).
 
-    OMP_NUM_THREADS=1 python benchmarks/studies/plan_tubes.py [--tasks cartpole,examples/car.py]
+    OMP_NUM_THREADS=1 python benchmarks/studies/plan_tubes.py [--tasks cartpole,car]
         [--bounds 0.1,0.25] [--plans 100] [--searched 10]
         [--json benchmarks/results/plan_tubes.json]
 
@@ -150,7 +150,7 @@ def _printed(rows: list[dict[str, Any]]) -> Table:
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--tasks", default="cartpole,examples/car.py,pvtol")
+    parser.add_argument("--tasks", default="cartpole,car,pvtol")
     parser.add_argument("--bounds", default="")
     parser.add_argument("--plans", type=int, default=100)
     parser.add_argument("--searched", type=int, default=10)

@@ -1,26 +1,23 @@
 """Two bodies among discs that the general planner is measured on: a car and a planar quadrotor.
 
-The bodies are those of `examples/car.py` and `lagros/Pvtol-v0`; the limits are those of C3M (Sun,
+The bodies are those of `lagros/Car-v0` and `lagros/Pvtol-v0`; the limits are those of C3M (Sun,
 Jha & Fan 2021). The discs are drawn another way than in the tasks, as they were when the figures
 were published.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import cast
-
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs import Task, find_task
+from lagros_envs.tasks.car.task import CarSettings
 from lagros_envs.tasks.pvtol.physics import Pvtol
 from lagros_policies.planning import Discs, Problem
 
 FloatArray = NDArray[np.float64]
 
 BODY_RADIUS, MARGIN, DISC_RADIUS = 0.2, 0.15, 0.5
-CAR = cast(Task, find_task(str(Path(__file__).parents[2] / "examples" / "car.py")))
+CAR = CarSettings()
 GRAVITY = Pvtol().gravity  # [m/s^2]
 
 

@@ -129,7 +129,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--tasks", default="cartpole,pvtol,examples/car.py")
+    parser.add_argument("--tasks", default="cartpole,pvtol,car")
     parser.add_argument("--kinds", default=",".join(kind for kind in _KINDS if kind in OPEN_LOOP))
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--json", type=Path)

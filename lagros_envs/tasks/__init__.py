@@ -37,4 +37,5 @@ SHIPPED = {
         "lagros_envs.tasks.spacecraft.vector:SpacecraftVectorEnv",
     ),
     "pvtol": Shipped("lagros_envs.tasks.pvtol.task:PvtolSettings", "Pvtol", 60),
+    "car": Shipped("lagros_envs.tasks.car.task:CarSettings", "Car", 60),
 }

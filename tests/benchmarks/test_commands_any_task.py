@@ -148,7 +148,7 @@ def test_what_a_task_of_one_body_lacks_is_said(invoke: Any) -> None:
         assert message in result.output
 
 
-@pytest.mark.parametrize("task", ["pvtol", Path(__file__).parents[2] / "examples" / "car.py"])
+@pytest.mark.parametrize("task", ["pvtol", "car"])
 def test_the_quadrotor_and_the_car_are_served_alike(task: Any, invoke: Any) -> None:
     result = invoke("watch", task, "--policy", "lqr", "--seconds", 0.5, "--video", "a.gif")
     assert result.exit_code == 0, result.output

@@ -140,7 +140,7 @@ def test_a_tube_that_is_a_tenth_too_small_is_crossed():
     ("task", "weights", "bound", "said"),
     [
         (PvtolSettings(), (1.0, 0.5), 0.02, "touches no disc, |phi| ≤ "),
-        ("examples/car.py", (1.0, 0.5), 0.05, "touches no disc, ‖x − x_d‖ ≤ "),
+        ("car", (1.0, 0.5), 0.05, "touches no disc, ‖x − x_d‖ ≤ "),
     ],
     ids=["pvtol", "car"],
 )
@@ -197,7 +197,7 @@ def test_every_law_that_is_a_gain_along_a_plan_is_spoken_of(policy):
         ("tube-mpc", "cartpole", 0.1),
         ("tube-mpc", "cartpole", 0.25),
         ("tube-mpc", "pvtol", 0.05),
-        ("tube-mpc", "examples/car.py", 0.1),
+        ("tube-mpc", "car", 0.1),
         ("lagros", "cartpole", 0.001),
         ("lagros", "cartpole", 0.05),
     ],
@@ -284,7 +284,7 @@ def test_no_direction_of_a_linear_loop_exceeds_what_is_predicted():
 
 
 def test_a_prediction_of_a_plane_counts_the_position_alone():
-    task = find_task("examples/car.py")
+    task = find_task("car")
     found = prediction_of(linear_loop(task, (1.0, 0.5), count=2))
     assert found.bound * found.last > task.goal_radius
 

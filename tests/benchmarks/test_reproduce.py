@@ -5,7 +5,6 @@ from __future__ import annotations
 import filecmp
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,6 +36,20 @@ FILES = (
     "cartpole_learned-mpc.safetensors",
     "cartpole_learned-mpc.json",
 )
+# A task in a file of one's own.
+GLIDE = """
+from lagros_envs.task import Defaults, Learning
+from tests.policies.toys import Slide
+
+
+class Glide(Slide):
+    name, title = "glide", "Glide"
+    learning = Learning()
+    defaults = Defaults(bounds=(0.4,), bound=0.4)
+
+
+task = Glide()
+"""
 DAMAGED = (".json", ".npz", ".safetensors")
 
 
@@ -108,11 +121,12 @@ def test_an_interrupted_run_ends_with_the_files_of_one_that_was_not(tmp_path):
 
 @pytest.mark.slow
 def test_a_task_of_ones_own_is_made_with_a_round_of_flights_and_gone_on_with(tmp_path):
-    car = str(Path(__file__).parents[2] / "examples" / "car.py")
+    own = tmp_path / "glide.py"
+    own.write_text(GLIDE, encoding="utf-8")
     training = TrainingSettings(hidden=(8, 8, 8), epochs=2, checkpoint_every=1)
     data = ExpertDataSettings(plans=20, samples=400, shards=2, disturbance_bound=0.4)
     settings = ReproduceSettings(
-        car,
+        str(own),
         MetricSettings(pool=1000, checks=500),
         data,
         rounds=(replace(data, seed=1),),
@@ -135,7 +149,7 @@ def test_a_task_of_ones_own_is_made_with_a_round_of_flights_and_gone_on_with(tmp
     with pytest.raises(InterruptedRunError):
         reproduce(tmp_path / "broken", settings, stop_in_the_round)
     benchmark = reproduce(tmp_path / "broken", settings)
-    files = [name.replace("cartpole", "car") for name in FILES]
+    files = [name.replace("cartpole", "glide") for name in FILES]
     same, different, missing = filecmp.cmpfiles(
         tmp_path / "whole", tmp_path / "broken", files, shallow=False
     )

@@ -102,12 +102,12 @@ def test_a_task_of_an_installed_package_is_found(tmp_path, monkeypatch):
     ("text", "message"),
     [
         ("cartpol", "unknown task 'cartpol'. Did you mean 'cartpole'. Valid: cartpole, "),
-        ("nothing", r'the path of a file with a task, such as "./car.py"; or "module:attribute"'),
+        ("nothing", r'the path of a file with a task, such as "./puck.py"; or "module:attribute"'),
         ("./nothing.py", "nothing.py': there is no such file"),
         ("json:nothing", "json:nothing: module 'json' has no attribute 'nothing'"),
         ("json:loads", r"json:loads: loads\(\) makes no task: TypeError"),
         ("math:pi", "math:pi is 3.14159.*; it must be a Task, a subclass"),
-        ("no_such_module:x", 'No module named.*name a file by its path, such as "./car.py"'),
+        ("no_such_module:x", 'No module named.*name a file by its path, such as "./puck.py"'),
         (f"{FILE}:Nothing", "puck.py has no attribute Nothing"),
     ],
 )
@@ -201,9 +201,9 @@ class Mutable:
 
 
 FAULTS = {
-    "no name": ({"name": None}, "name=None must be set to a text like 'car'"),
-    "name": ({"name": "My puck"}, "name='My puck' must be set to a text like 'car'"),
-    "title": ({"title": "puck"}, "title='puck' must be set to a text like 'Car'"),
+    "no name": ({"name": None}, "name=None must be set to a text like 'puck'"),
+    "name": ({"name": "My puck"}, "name='My puck' must be set to a text like 'puck'"),
+    "title": ({"title": "puck"}, "title='puck' must be set to a text like 'Puck'"),
     "unit": ({"state_names": ("x", "y", "vx", "vy")}, r"a name and its unit in brackets"),
     "names": ({"control_names": ("a [N]",)}, "must be 2 texts, one for each control"),
     "scale": ({"control_scale": (1.0,)}, r"control_scale=\(1.0,\) must be a tuple of 2 numbers"),

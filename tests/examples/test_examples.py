@@ -45,8 +45,7 @@ def check(before, after, returns, episodes):
 
 
 def test_every_example_is_tested_and_says_how_it_is_run():
-    # The car is a task, with tests of its own.
-    names = sorted(path.stem for path in EXAMPLES.glob("*.py") if path.stem != "car")
+    names = sorted(path.stem for path in EXAMPLES.glob("*.py"))
     assert names == [
         "cleanrl_ppo_cartpole",
         "metric_in_cvxpy",

@@ -3,7 +3,6 @@
 import itertools
 import subprocess
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from lagros_policies.export.program import Part, Program, Vector
 from lagros_policies.learning.features import view_of
 from lagros_policies.learning.networks import Mlp
 
-CAR = str(Path(__file__).parents[2] / "examples" / "car.py")
 IDENTITY = np.eye(12, dtype=np.float32)
 
 
@@ -49,7 +47,7 @@ def network_of(task, folder, seed=0):
     return folder / "own.safetensors"
 
 
-@pytest.mark.parametrize("name", ["pvtol", CAR])
+@pytest.mark.parametrize("name", ["pvtol", "car"])
 def test_a_task_of_anybody_is_exported_with_its_features(name, answer, tmp_path):
     task = find_task(name)
     source = load_source(f"lagros-{name}", network_of(task, tmp_path))

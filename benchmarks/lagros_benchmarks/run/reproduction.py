@@ -65,7 +65,7 @@ def reproduce(
     folder = folder.absolute()
     record = {name: value for name, value in asdict(settings).items() if name not in settings.free}
     if "task" in record:
-        # However it was called: ./car.py or car.py.
+        # However it was called: ./puck.py or puck.py.
         record["task"] = find_task(record["task"]).name
     folder.mkdir(parents=True, exist_ok=True)
     claim(folder / "settings.json", record, "a run")

@@ -1,0 +1,99 @@
+"""Across a field of discs at the speed of a car that cannot stop: the car's task."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lagros_envs.arrays import FloatArray
+from lagros_envs.task import Defaults, Feedback, Learning, MetricDesign, Scenario, Task
+from lagros_envs.tasks.car.physics import Car
+
+_DISC_RADIUS = 0.5  # [m]
+_PASSAGE = 0.15  # between two discs a body has twice as much room [m]
+
+
+@dataclass(frozen=True)
+class CarSettings(Task):
+    """Cross 9 m of three to five discs in 6 s, at 1 to 2 m/s.
+
+    Limits of the state and of the turn rate are those of C3M (Sun, Jha & Fan 2021). A success is a
+    body without collision that comes within 0.3 m of the goal.
+
+    Attributes:
+        system: The car.
+        control_period: Zero-order hold [s].
+        time_limit: Length of an episode and of a plan [s].
+    """
+
+    system: Car = field(default_factory=Car)
+    control_period: float = 0.1
+    time_limit: float = 6.0
+
+    name, title = "car", "Car"
+    state_names = ("x [m]", "y [m]", "theta [rad]", "v [m/s]")
+    control_names = ("omega [rad/s]", "a [m/s^2]")
+    state_low = (-math.inf, -math.inf, -math.inf, 1.0)
+    state_high = (math.inf, math.inf, math.inf, 2.0)
+    control_low, control_high, control_scale = (-3.0, -3.0), (3.0, 3.0), (3.0, 3.0)
+    goal_radius = 0.3
+    position = (0, 1)
+    body_radius = 0.2
+    most_discs = 5
+    margin = 0.25
+    # The controls turn all that the motion depends on: a metric of x_d.
+    metric = MetricDesign(
+        low=(-5.0, -5.0, -math.pi, 0.5),
+        high=(15.0, 5.0, math.pi, 2.5),
+        error=(0.5, 0.5, 0.5, 0.5),
+        control_low=(-3.0, -1.0),
+        control_high=(3.0, 1.0),
+        basis=tuple(
+            angle if power == "1" else power if angle == "1" else f"{angle}*{power}"
+            for angle in ("1", "cos(x[2])", "sin(x[2])", "cos(x[2])^2", "cos(x[2])*sin(x[2])")
+            for power in ("1", "x[3]")
+        ),
+        point="nominal",
+    )
+    feedback = Feedback((1.0, 1.0, 0.3, 0.3), (0.06, 0.06))
+    learning = Learning(
+        plans=2000,
+        samples=120_000,
+        disturbance_bound=0.4,
+        hidden=(64, 64, 128, 128),
+        epochs=30,
+        learned_epochs=12,
+        batch=256,
+        rounds=3,
+        round_plans=2000,
+        round_samples=40_000,
+        round_epochs=20,
+        mpc_samples=0,
+    )
+    defaults = Defaults(bounds=(0.4,), bound=0.4)
+
+    def sample(self, rng: np.random.Generator) -> Scenario:
+        """Draw start, goal and discs between them, all passages open."""
+        start, goal = (np.array([x, *rng.uniform((-2, -0.5), (2, 0.5)), 1.5]) for x in (0.0, 9.0))
+        keep = _DISC_RADIUS + self.body_radius + _PASSAGE
+        ends = np.stack([start[:2], goal[:2]])
+        while True:
+            count = int(rng.integers(3, self.most_discs + 1))
+            low, high = (1.5, -2.5, _DISC_RADIUS), (7.5, 2.5, _DISC_RADIUS)
+            discs = rng.uniform(low, high, (count, 3))
+            apart = np.linalg.norm(discs[:, None, :2] - discs[:, :2], axis=-1)
+            apart += 1e9 * np.eye(count)
+            gaps = np.linalg.norm(discs[:, None, :2] - ends, axis=-1)
+            if np.all(apart >= 2.0 * keep) and np.all(gaps >= keep + 0.1):
+                return Scenario(start, goal, discs)
+
+    def outline(self, state: FloatArray) -> Sequence[FloatArray]:
+        """Return the body with its nose, within the circle that collides."""
+        place, heading = state[:2], state[2]
+        along = np.array([math.cos(heading), math.sin(heading)])
+        across = np.array([-along[1], along[0]])
+        corners = ((-0.17, -0.1), (0.1, -0.1), (0.2, 0.0), (0.1, 0.1), (-0.17, 0.1))
+        return [np.stack([place + x * along + y * across for x, y in corners])]
