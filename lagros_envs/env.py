@@ -61,7 +61,8 @@ class TaskEnv(OfTask, Conforming, gym.Env[Float32Array, Float32Array]):
 
     ## Starting state
     `task.sample`. `reset(options=...)` takes `initial_state`, `goal`, `nominal` (x_d at every
-    control instant, shape (steps + 1, n)) and, where the task has discs, `discs` (k, 3). A reset
+    control instant, shape (steps + 1, n)), where the task has discs `discs` (k, 3), and
+    `initial_error` (n,), by which the body begins beside the initial state that is told. A reset
     that is refused leaves the environment as it was.
 
     ## Episode end
@@ -149,9 +150,8 @@ class TaskEnv(OfTask, Conforming, gym.Env[Float32Array, Float32Array]):
         names = self._rules.names
         self._end_at = slice(names.index("reward"), names.index("inside"))
         self._size = names.index("size" if "size" in names else "distance")
-        self._n, self._shape = self.settings.system.state_dim, self.action_space.shape
-        m = self.settings.system.control_dim
-        self._apply = OnFloats(partial(of_task.applied, self.settings), a=m)
+        self._n, self._shape = self.settings.system.state_dim, box.shape
+        self._apply = OnFloats(partial(of_task.applied, self.settings), a=self._shape[0])
         self._begin = OnFloats(self._rules.begun, x=self._n, g=self._rules.given)
         self._renderer: Renderer | None = None
         self._started = False
@@ -168,7 +168,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[Float32Array, Float32Array]):
         Args:
             seed: Seed of the episode; the scenario and the disturbance have a stream each. None
                 goes on drawing from the generator that the last seed has left.
-            options: `initial_state` (n,), `goal` (n,), `nominal` (steps + 1, n), `discs` (k, 3).
+            options: `initial_state`, `initial_error`, `goal`, `nominal`, `discs`; see the class.
 
         Returns:
             The observation and the info.
@@ -180,10 +180,9 @@ class TaskEnv(OfTask, Conforming, gym.Env[Float32Array, Float32Array]):
         given = of_task.stated_scenario(options, self.settings) if options else {}
         nominal = of_task.stated_nominal(options, self.settings) if options else None
         if self.disturbance.kind == "worst" and nominal is None:
-            n = self.settings.system.state_dim
             raise ValueError(
                 'disturbance="worst" needs the nominal trajectory of the episode: pass '
-                f'reset(options={{"nominal": array of shape (steps + 1, {n})}})'
+                f'reset(options={{"nominal": array of shape (steps + 1, {self._n})}})'
             )
         seed = plain_seed(seed)
         super().reset(seed=seed)
@@ -193,6 +192,8 @@ class TaskEnv(OfTask, Conforming, gym.Env[Float32Array, Float32Array]):
             start = of_task.starts_of(self.settings, scenario)[0]
         self._start, self.nominal = start, nominal
         self._state, self._goal, _, self._fixed, self._blank = start
+        if "initial_error" in given:
+            self._state = tuple((self._state + given["initial_error"]).tolist())
         self._step = 0
         self._now = self._clock[0]
         self._outcome = (0.0, 0.0, 0.0, math.inf) if self._discs else (0.0, 0.0, math.inf)
@@ -227,8 +228,7 @@ class TaskEnv(OfTask, Conforming, gym.Env[Float32Array, Float32Array]):
         self._now = self._clock[step] if step <= self._steps else self._instant(step)
         self._advance(control)
         reward, over = self._outcome[self._end_at]
-        if self._discs:
-            over = over or self._outcome[0] > 0.0
+        over = over or (self._discs and self._outcome[0] > 0.0)
         if self.render_mode == "human":
             self.render()
         truncated = step >= self._steps

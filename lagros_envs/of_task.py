@@ -136,7 +136,7 @@ def contacts(task: Task, discs: FloatArray) -> FloatArray:
 
 def option_names(task: Task) -> tuple[str, ...]:
     """Return what `reset(options=...)` may hold."""
-    names = ("initial_state", "goal", "nominal")
+    names = ("initial_state", "initial_error", "goal", "nominal")
     return (*names, "discs") if task.most_discs else names
 
 
@@ -146,7 +146,7 @@ def stated_scenario(
     batch: tuple[int, ...] = (),
     looked_at: BoolArray | None = None,
 ) -> dict[str, FloatArray]:
-    """Return the parts of a `Scenario` that the options hold.
+    """Return the parts of a `Scenario` that the options hold, and the error at its start.
 
     Args:
         options: As given to reset.
@@ -166,6 +166,11 @@ def stated_scenario(
         if np.any(task.fallen([*read.T], functions)):
             raise ValueError(f"options['initial_state'] {task.fallen_start(read)}")
         given["initial_state"] = start
+    if "initial_error" in options:
+        meaning = "x(0) minus the initial state that is told"
+        value = options["initial_error"]
+        error = option_numbers("initial_error", value, shape, looked_at=looked_at, meaning=meaning)
+        given["initial_error"] = error
     if "goal" in options:
         given["goal"] = _goal(options["goal"], task, shape, looked_at)
     if "discs" in options:
@@ -225,7 +230,7 @@ def stated_nominal(
 def scenario_with(drawn: Scenario, stated: dict[str, FloatArray]) -> Scenario:
     """Return a scenario with the parts that were stated in place of those that were drawn."""
     parts = {"initial_state": drawn.initial_state, "goal": drawn.goal, "discs": drawn.discs}
-    return Scenario(**{**parts, **stated})
+    return Scenario(**{name: stated.get(name, value) for name, value in parts.items()})
 
 
 def starts_of(task: Task, scenarios: Scenario) -> list[Start]:

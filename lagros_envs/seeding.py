@@ -1,4 +1,4 @@
-"""One seed, three independent streams: the scenario, the disturbance, and what the policy draws.
+"""One seed, independent streams: scenario, disturbance, what the policy draws, initial error.
 
 Because the streams are separate, every policy meets the same starts and the same disturbances
 whatever it draws itself, and a larger disturbance bound scales the same realisation.
@@ -21,7 +21,7 @@ _Words = NDArray[np.uint32]
 # empty namespace, so that no evaluation meets a training scenario, whatever the two seeds are.
 EVALUATION = 0x6576616C
 # In the order in which the seed of an episode is split.
-_STREAMS = ("scenario", "disturbance", "policy")
+_STREAMS = ("scenario", "disturbance", "policy", "initial_error")
 
 
 class Streams:
@@ -50,6 +50,11 @@ class Streams:
     def policy(self) -> np.random.Generator:
         """What a policy may draw from."""
         return self._generator("policy")
+
+    @cached_property
+    def initial_error(self) -> np.random.Generator:
+        """What the error at the start of an episode is drawn from, where it has one."""
+        return self._generator("initial_error")
 
     def __iter__(self) -> Iterator[np.random.Generator]:
         """Give the three streams."""

@@ -45,8 +45,8 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
 
     Spaces, dynamics, reward and info are those of `TaskEnv`, with a leading axis of worlds; seeds,
     masks and autoreset are those of `autoreset.RestartingVectorEnv`, with one row per world.
-    `reset(options=...)` also takes `initial_state` (num_envs, n), `goal` (num_envs, n), `nominal`
-    (num_envs, steps + 1, n) and, where the task has discs, `discs` (num_envs, k, 3).
+    `reset(options=...)` also takes `initial_state`, `initial_error` and `goal` (num_envs, n),
+    `nominal` (num_envs, steps + 1, n) and, where the task has discs, `discs` (num_envs, k, 3).
 
     Args:
         num_envs: Number of worlds.
@@ -245,6 +245,8 @@ class TaskVectorEnv(OfTask, RestartingVectorEnv):
         kept = np.zeros((rows.count, count))
         state = kept[rows.state]
         state[:], kept[rows.goal] = scenario.initial_state.T, scenario.goal.T
+        if "initial_error" in stated:
+            state += stated["initial_error"].T
         kept[rows.radius], kept[rows.success_time] = self._radii[0], np.inf
         if rows.collided is not None:
             kept[rows.start] = state[list(task.position)]

@@ -118,7 +118,7 @@ class Subject:
     make: Callable[..., Any]
     player: type[Player] = Player
     cartpole: bool = True
-    options: tuple[str, ...] = ("initial_state", "goal", "nominal")
+    options: tuple[str, ...] = ("initial_state", "initial_error", "goal", "nominal")
     own_copy: bool = field(default=True, kw_only=True)
 
     def players(self, count: int = 1, **arguments: Any) -> list[Player]:
@@ -132,7 +132,7 @@ def _vector(make: Callable[..., Any], mode: str, **fixed: Any) -> Callable[..., 
 
 _OF_WORLD = ("scenario", "nominal")
 _OF_WORLDS = ("scenarios", "nominal", "reset_mask")
-_OF_CARTS = ("initial_state", "goal", "nominal", "reset_mask")
+_OF_CARTS = ("initial_state", "initial_error", "goal", "nominal", "reset_mask")
 
 SINGLE = {
     "cart-pole": Subject(CartPoleEnv),

@@ -235,7 +235,10 @@ def test_the_state_is_kept_where_it_cannot_be_integrated():
         ({"discs": [[0.0, 0.0, -1.0]]}, "holds the radius -1; it must be >= 0"),
         ({"initial_state": [6.0, 0.0, 0.0, 0.0]}, "episode of puck has already ended"),
         ({"goal": 1.0}, r"shape \(\)"),
-        ({"obstacles": []}, "its entries may be initial_state, goal, nominal, discs"),
+        (
+            {"obstacles": []},
+            "its entries may be initial_state, initial_error, goal, nominal, discs",
+        ),
     ],
 )
 def test_options_that_cannot_be_are_refused(options, message):

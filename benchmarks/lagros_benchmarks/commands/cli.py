@@ -131,6 +131,14 @@ def bench(
             "to a second for each, policy and bound.",
         ),
     ] = False,
+    initial_error: Annotated[
+        float,
+        typer.Option(
+            metavar="SHARE",
+            help="One body: begin beside the plan, by up to this share of the scale of each "
+            "coordinate, and show how the error dies out.",
+        ),
+    ] = 0.0,
     json: Annotated[
         Path | None, file_option("All figures, one object per policy and condition.")
     ] = None,
@@ -215,6 +223,7 @@ def bench(
             timing_episodes=timing_episodes,
             backend=Backend(backend, address),
             guarantee=guarantee,
+            initial_error=initial_error,
         )
         for name in settings.policies:
             check_policy(name, described.name)

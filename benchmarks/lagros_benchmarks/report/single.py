@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from lagros_benchmarks.run.convergence import (
+    convergence_rates,
+    error_areas,
+    tightest_envelope,
+)
 from lagros_benchmarks.run.episodes import TUBE_TOLERANCE, EpisodeRecord, added_up
 from lagros_benchmarks.run.experiment import Row
 from lagros_benchmarks.run.metrics import (
     carry_forward,
     effort_ratio,
     mean_interval,
+    median_ratio,
     paired_success_difference,
     step_time_statistics,
     wilson_interval,
@@ -36,6 +42,7 @@ def figures(run: SingleRun, case: Case) -> Row:
         **_efforts(records),
         **_times(run, case),
         **_tracking(run, case),
+        **_convergence(run, case),
         "guarantee": run.settings.guarantee,
         **_guarantees(records),
         "units": _units(run.task),
@@ -151,6 +158,59 @@ def _tracking(run: SingleRun, case: Case) -> Row:
     }
 
 
+def _convergence(run: SingleRun, case: Case) -> Row:
+    """Return the area under the error and, where episodes begin beside plans, how it dies out."""
+    found = _dying_out(run.episodes[case])
+    areas = found.areas * run.control_period
+    row: Row = {
+        "initial_error": run.settings.initial_error,
+        **_mean("error_area", areas[~np.isnan(areas)]),
+    }
+    if not run.settings.initial_error:
+        return row
+    curves, peaks = found.normalised, found.overshoots[~np.isnan(found.overshoots)]
+    overshoot, rates = None, np.zeros(0)
+    if len(curves) and np.isfinite(peaks).all():
+        overshoot = tightest_envelope(curves[np.argmax(peaks)], run.control_period).overshoot
+        rates = convergence_rates(curves, overshoot, run.control_period)
+    return {
+        **row,
+        **_mean("normalised_area", error_areas(curves, run.control_period)),
+        **_mean("overshoot", peaks),
+        "envelope_overshoot": overshoot,
+        **_mean("convergence_rate", rates),
+    }
+
+
+class _DyingOut(NamedTuple):
+    """Errors of episodes; one that ended early counts on with its largest.
+
+    Attributes:
+        areas: Integral of ||x - x_d|| over the control steps, shape (episodes,); nan without plan.
+        normalised: e(t) / e(0) of those that begin beside their plan, shape (k, instants).
+        overshoots: Largest e(t) / e(0), shape (episodes,); nan without.
+    """
+
+    areas: FloatArray
+    normalised: FloatArray
+    overshoots: FloatArray
+
+
+def _dying_out(records: Sequence[EpisodeRecord]) -> _DyingOut:
+    with np.errstate(invalid="ignore"):
+        curves = carry_forward(np.array([record.tracking_error for record in records]))
+    beside = np.array([record.beside_plan for record in records]) & (curves[:, 0] > 0.0)
+    normalised = curves[beside] / curves[beside, :1]
+    overshoots = np.full(len(records), np.nan)
+    overshoots[beside] = normalised.max(axis=1)
+    return _DyingOut(error_areas(curves, 1.0), normalised, overshoots)
+
+
+def _mean(name: str, values: Sequence[float] | FloatArray) -> Row:
+    mean = float(np.mean(values)) if len(values) else None
+    return {f"{name}_mean": mean, f"{name}_ci95": mean_interval(values)}
+
+
 def _certified(records: Sequence[EpisodeRecord]) -> Row:
     """Return the widest tube of the guaranteed episodes, and how many flights left their own."""
     known = [r.left_certified_tube for r in records if r.left_certified_tube is not None]
@@ -198,10 +258,23 @@ def comparison(ours: Sequence[EpisodeRecord], theirs: Sequence[EpisodeRecord]) -
     effort = effort_ratio(
         [r.effort for r in ours], solved, [r.effort for r in theirs], their_solved
     )
+    error, their_error = _dying_out(ours), _dying_out(theirs)
+    ratios = _ratio("error_area", error.areas, their_error.areas)
+    if any(record.beside_plan for record in ours):
+        ratios |= _ratio("overshoot", error.overshoots, their_error.overshoots)
     return {
         "success_difference": success.difference,
         "success_difference_ci95": success.interval,
         "effort_ratio": None if effort is None else effort.ratio,
         "effort_ratio_ci95": None if effort is None else effort.interval,
         "episodes_both_solve": 0 if effort is None else effort.episodes,
+        **ratios,
+    }
+
+
+def _ratio(name: str, ours: FloatArray, theirs: FloatArray) -> Row:
+    found = median_ratio(ours, theirs)
+    return {
+        f"{name}_ratio": None if found is None else found.ratio,
+        f"{name}_ratio_ci95": None if found is None else found.interval,
     }

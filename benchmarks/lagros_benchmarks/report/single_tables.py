@@ -36,6 +36,12 @@ _PLAIN_LEGEND = (
 )
 
 
+_BESIDE_LEGEND = (
+    "Success and strict success with 95 % intervals; episodes begin beside their plan by e(0). "
+    "area: integral of ‖e(t)‖/‖e(0)‖, e = x − x_d, and peak: the largest of it, both the mean; C, "
+    "rate: its tightest envelope C exp(−λt), C of the highest peak, λ the mean; Δt: time of one "
+    "call of predict. What ended early counts on with its largest error."
+)
 _GUARANTEE_LEGEND = (
     " Proved: episodes of which it is proved, for every disturbance up to d̄, that they are strict "
     "successes; bound: what is proved of the largest ‖x − x_d‖ over what these flights came to."
@@ -44,11 +50,13 @@ _GUARANTEE_LEGEND = (
 
 def framed(row: Row) -> bool:
     """Return whether the terminal table has room for a frame in 80 columns."""
-    return _has_tube(row) and not row.get("guarantee")
+    return _has_tube(row) and not row.get("guarantee") and not row.get("initial_error")
 
 
 def legend(row: Row) -> str:
     """Return what the columns mean."""
+    if row.get("initial_error"):
+        return _BESIDE_LEGEND
     said = _LEGEND if _has_tube(row) else _PLAIN_LEGEND
     return said + _GUARANTEE_LEGEND if row.get("guarantee") else said
 
@@ -61,6 +69,16 @@ def columns(row: Row) -> tuple[Column, ...]:
         ("success", "%", lambda row: with_interval(row["success_rate"], row["success_ci95"])),
         ("strict", "%", lambda row: percent(row["strict_success_rate"])),
     )
+    if row.get("initial_error"):
+        return (
+            *begin,
+            ("area", "s", lambda row: number(row["normalised_area_mean"])),
+            ("peak", "", lambda row: number(row["overshoot_mean"])),
+            ("C", "", lambda row: number(row["envelope_overshoot"])),
+            ("rate", "1/s", lambda row: number(row["convergence_rate_mean"])),
+            ("effort", effort, lambda row: number(row["effort_mean"])),
+            ("Δt ms", "median", lambda row: milliseconds(row["step_time_median_s"])),
+        )
     middle: tuple[Column, ...] = (
         ("effort", effort, lambda row: number(row["effort_mean"])),
         ("Δt ms", "median", lambda row: milliseconds(row["step_time_median_s"])),

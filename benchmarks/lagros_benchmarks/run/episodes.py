@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -50,6 +50,7 @@ class EpisodeRecord(Keepable):
             strict success; None where that was not asked or no statement is about the policy.
         error_bound: What is proved of max_tracking_error; None where there is no tube.
         error_bounds: Likewise of tracking_error.
+        beside_plan: Whether the episode was begun beside its plan, by an initial error.
         counters: What the policy counts, summed over the episode.
         timed_counters: Those of them that depend on the clock; left out of the comparison.
         error: The exception that ended the episode, which is then a failure; None if none did.
@@ -81,6 +82,7 @@ class EpisodeRecord(Keepable):
     guaranteed: bool | None = None
     error_bound: float | None = None
     error_bounds: FloatArray | None = field(default=None, compare=False, repr=False)
+    beside_plan: bool = False
 
 
 def added_up(counters: Iterable[Mapping[str, int]]) -> dict[str, int]:
@@ -99,18 +101,22 @@ def run_episode(
     nominal: FloatArray | None,
     *,
     label: str | None = None,
+    initial_error: FloatArray | None = None,
 ) -> EpisodeRecord:
     """Run one episode in an environment of one body to its end.
 
     An exception in the policy or the environment ends the episode as a failure that is written
     down with its text; it is never raised and the episode is never dropped. The plan is x_d
-    at every control instant, shape (steps + 1, n), or None where there is none.
+    at every control instant, shape (steps + 1, n), or None where there is none. With an initial
+    error, shape (n,), the body begins beside the initial state that the policy is told.
     """
     loop = ClosedLoop(env, policy)
     errors: list[float] = []
     counters: dict[str, int] = {}
+    given = {"nominal": nominal, "initial_error": initial_error}
+    options = {name: value for name, value in given.items() if value is not None}
     with Attempt() as attempt:
-        for _ in loop.fly(seed, {} if nominal is None else {"nominal": nominal}):
+        for _ in loop.fly(seed, options):
             if "tracking_error" in loop.info:
                 error = float(loop.info["tracking_error"])
                 # A state that overflowed is infinitely far away, not unmeasured.
@@ -119,7 +125,11 @@ def run_episode(
     with Attempt() as counting:
         counters = loop.counters()
     name = label or loop.policy.name
-    return _record(loop, name, seed, errors, counters, attempt.error or counting.error)
+    record = _record(loop, name, seed, errors, counters, attempt.error or counting.error)
+    if initial_error is None:
+        return record
+    # The tubes are about episodes that begin on their plan.
+    return replace(record, beside_plan=True, left_paper_tube=None)
 
 
 def _record(

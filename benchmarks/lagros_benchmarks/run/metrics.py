@@ -43,6 +43,14 @@ class EffortRatio(NamedTuple):
     episodes: int
 
 
+class MedianRatio(NamedTuple):
+    """Median over paired episodes of what one policy has over what another has."""
+
+    ratio: float
+    interval: Interval | None
+    episodes: int
+
+
 def wilson_interval(successes: int, trials: int, confidence: float = CONFIDENCE) -> Interval:
     """Return Wilson's score interval of a rate.
 
@@ -138,6 +146,37 @@ def effort_ratio(
         return None
     interval = _bootstrap((ours, theirs), _ratio_of_means) if ours.size > 1 else None
     return EffortRatio(float(ours.mean() / theirs.mean()), interval, int(ours.size))
+
+
+def median_ratio(
+    ours: Sequence[float] | FloatArray, theirs: Sequence[float] | FloatArray
+) -> MedianRatio | None:
+    """Return the median of the ratios of two policies on the same episodes.
+
+    The median and not the mean: one episode that diverges would decide a mean, in our favour or in
+    theirs. Its interval is that of two order statistics, which assumes nothing of the distribution.
+
+    Args:
+        ours: Of each episode, nan where it was not measured.
+        theirs: Of the same episodes.
+
+    Returns:
+        The ratio with its interval (None for fewer than six episodes), or None if no episode was
+        measured for both.
+    """
+    above, below = np.asarray(ours, dtype=np.float64), np.asarray(theirs, dtype=np.float64)
+    paired = np.isfinite(above) & np.isfinite(below) & (below > 0.0)
+    ratios = np.sort(above[paired] / below[paired])
+    if ratios.size == 0:
+        return None
+    from scipy.stats import binom
+
+    count = int(ratios.size)
+    rank = int(binom.ppf((1.0 - CONFIDENCE) / 2.0, count, 0.5))
+    interval = None
+    if rank:
+        interval = Interval(float(ratios[rank - 1]), float(ratios[count - rank]))
+    return MedianRatio(float(np.median(ratios)), interval, count)
 
 
 def _ratio_of_means(ours: FloatArray, theirs: FloatArray, axis: int = -1) -> Any:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from lagros_envs.checks import (
     check_disturbance_bound,
     check_fields,
+    check_not_negative,
     check_seed,
     check_whole,
     shown,
@@ -139,6 +140,9 @@ class BenchmarkSettings:
         backend: Whose processes the workers are.
         guarantee: Whether it is proved of how many episodes of one body what they come to; takes
             up to a second for each plan, policy and bound.
+        initial_error: How far beside its plan an episode of one body begins: x(0) - x_d(0) is drawn
+            from a box of this share of the scale of each coordinate (`run.initial_errors`), the
+            same for all policies, while the initial state that they are told is that of the plan.
 
     Raises:
         ValueError: A setting is not valid.
@@ -161,6 +165,7 @@ class BenchmarkSettings:
     timing_episodes: int = 10
     backend: Backend = LOKY
     guarantee: bool = False
+    initial_error: float = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -182,7 +187,13 @@ class BenchmarkSettings:
         for name, most in _MOST.items():
             check_whole(name, getattr(self, name), 1, most)
         check_seed(self.seed)
+        check_not_negative("initial_error", self.initial_error)
         check_fits(task, preset=self.preset, agents=self.agents, safety_filter=self.safety_filter)
+        if self.guarantee and self.initial_error:
+            raise ValueError(
+                f"guarantee=True is about episodes that begin on their plan; leave it out, or "
+                f"initial_error={self.initial_error:g}"
+            )
         if task.most_agents > 1:
             self._check_worlds(task)
         self._check_policy_settings()
@@ -212,8 +223,11 @@ class BenchmarkSettings:
             raise ValueError(f"policy_settings names {strangers}, which do not run")
 
     def _check_worlds(self, task: Described) -> None:
-        if self.guarantee:
-            raise ValueError(f"guarantee=True is for one body; leave it out for {task.name}")
+        for name in ("guarantee", "initial_error"):
+            if getattr(self, name):
+                raise ValueError(
+                    f"{name}={getattr(self, name)} is for one body; leave it out for {task.name}"
+                )
         if self.preset not in task.presets:
             raise ValueError(unknown_name("preset", self.preset, task.presets))
         if self.safety_filter not in SAFETY_FILTERS:

@@ -12,6 +12,7 @@ import numpy as np
 from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.episodes import EpisodeRecord, run_episode
 from lagros_benchmarks.run.experiment import BenchmarkRun
+from lagros_benchmarks.run.initial_errors import initial_error
 from lagros_benchmarks.run.keeping import Keepable, Kept
 from lagros_benchmarks.run.library import (
     SetupError,
@@ -43,12 +44,14 @@ class NominalPlan(Keepable):
         states: x_d at every control instant, or None if the planner found no plan.
         defect: How far the plan misses the dynamics; nan if the planner raised.
         error: What went wrong, or None.
+        initial_error: x(0) - x_d(0), shape (n,); None where the episode begins on its plan.
     """
 
     seed: int
     states: FloatArray | None
     defect: float
     error: str | None
+    initial_error: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,15 @@ class SingleExperiment:
         env = self.environment(case.condition)
         policy = self.policy(case.policy, env)
         return [
-            run_episode(env, policy, plan.seed, plan.states, label=case.policy) for plan in units
+            run_episode(
+                env,
+                policy,
+                plan.seed,
+                plan.states,
+                label=case.policy,
+                initial_error=plan.initial_error,
+            )
+            for plan in units
         ]
 
     def finish(
@@ -252,16 +263,18 @@ def _plan_chunk(experiment: SingleExperiment, seeds: Sequence[int]) -> list[Nomi
     plans = []
     for seed in seeds:
         env.reset(seed=seed)
-        scenario = env.scenario
+        scenario, share = env.scenario, experiment.settings.initial_error
+        error = initial_error(experiment.task, scenario, seed, share) if share else None
         discs = scenario.discs if len(scenario.discs) else None
         try:
             plan = planner.plan(scenario.initial_state, scenario.goal, discs=discs)
-        except ImportError as error:  # of a solver: no plan would be worth anything
-            raise SetupError.building("the planner", error) from error
-        except Exception as error:
-            plans.append(NominalPlan(seed, None, float("nan"), describe_error(error)))
+        except ImportError as raised:  # of a solver: no plan would be worth anything
+            raise SetupError.building("the planner", raised) from raised
+        except Exception as raised:
+            text = describe_error(raised)
+            plans.append(NominalPlan(seed, None, float("nan"), text, error))
             continue
         states = np.asarray(plan.states, dtype=np.float64) if plan.solved else None
         problem = None if plan.solved else f"not solved, defect {plan.defect:.3g}"
-        plans.append(NominalPlan(seed, states, float(plan.defect), problem))
+        plans.append(NominalPlan(seed, states, float(plan.defect), problem, error))
     return plans
