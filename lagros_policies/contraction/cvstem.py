@@ -36,6 +36,7 @@ __all__ = [
     "design_metric",
     "design_on_pool",
     "design_on_region",
+    "least_condition",
     "search_rate",
 ]
 
@@ -82,6 +83,31 @@ def design_metric(
     """
     every = np.arange(len(samples.state))
     return _design(system, samples, every, region, settings, _Effort(0, _BOUND_ROUNDS))
+
+
+def least_condition(
+    system: System, samples: Samples, region: MetricRegion, settings: CvStemSettings
+) -> float:
+    """Return chi of the program over samples alone, solved once and searched for nothing.
+
+    Where this finds no metric there is none, which is said within seconds.
+
+    Args:
+        system: The system.
+        samples: Where the condition is imposed.
+        region: Where the bounds are, at a few places.
+        settings: What to design.
+
+    Raises:
+        InfeasibleError: No metric exists for this alpha, region and basis.
+        RuntimeError: The solver stopped for another reason.
+        ValueError: As of `design_metric`.
+    """
+    settings = resolved(system, region, settings)
+    where = region, settings.phi, settings.point, system.state_dim
+    places = places_of(*where, _BOUND_ANGLES, _BOUND_STATES)
+    conditions = condition_rows(system, samples, settings)
+    return solve_program(conditions, places, region, settings)[2]
 
 
 def design_on_pool(

@@ -55,26 +55,36 @@ class MetricSettings:
             InfeasibleError: No such metric exists.
             RuntimeError: The solver stopped, or the condition was not met everywhere.
         """
-        wanted = task.metric
-        if wanted is None:
-            raise ValueError(
-                f"{task.name} describes no contraction metric: give its class `metric = "
-                "MetricDesign(...)`"
-            )
-        region = BoxRegion(
-            wanted.low, wanted.high, wanted.error, wanted.control_low, wanted.control_high
-        )
-        design = CvStemSettings(
-            contraction_rate=wanted.rate,
-            control_penalty=_PENALTY,
-            margin=wanted.margin,
-            scaling=wanted.scaling or (1.0,) * task.system.state_dim,
-            basis=Basis(wanted.basis),
-            point=cast(Literal["state", "nominal"], wanted.point),
-        )
+        region, design = described(task)
         metric = design_on_region(task.system, region, design, self.pool, seed=self.seed)
         fresh = region.sample(np.random.default_rng([self.seed, _CHECK]), self.checks)
         return verify_metric(task.system, metric, fresh, self.seed)
+
+
+def described(task: Task) -> tuple[BoxRegion, CvStemSettings]:
+    """Return where a task's metric has to hold, and which it is to be.
+
+    Raises:
+        ValueError: The task describes none.
+    """
+    wanted = task.metric
+    if wanted is None:
+        raise ValueError(
+            f"{task.name} describes no contraction metric: give its class `metric = "
+            "MetricDesign(...)`"
+        )
+    region = BoxRegion(
+        wanted.low, wanted.high, wanted.error, wanted.control_low, wanted.control_high
+    )
+    design = CvStemSettings(
+        contraction_rate=wanted.rate,
+        control_penalty=_PENALTY,
+        margin=wanted.margin,
+        scaling=wanted.scaling or (1.0,) * task.system.state_dim,
+        basis=Basis(wanted.basis),
+        point=cast(Literal["state", "nominal"], wanted.point),
+    )
+    return region, design
 
 
 def metric_settings(task: Task) -> Any:

@@ -32,6 +32,7 @@ from lagros_policies.contraction import (
     theorems,
     verify_metric,
 )
+from lagros_policies.contraction.cvstem import least_condition
 from lagros_policies.proof import bounds
 from lagros_policies.proof.condition import prove_contraction
 from lagros_policies.remarks.stochastic import mean_square_bound
@@ -244,6 +245,10 @@ def test_a_design_is_the_optimum_of_the_program_stated_in_cvxpy(
     assert values.min() >= 1.0 - 1e-6
     assert values.max() <= metric.condition_bound * (1.0 + 1e-6)
     assert (metric.basis, metric.point, metric.region) == (basis, point, box)
+    # Solved once, with the bounds at a few places: as good, or less.
+    least = least_condition(system, samples, box, settings)
+    assert least <= metric.condition_bound * 1.02
+    assert basis.degree or least == pytest.approx(metric.condition_bound, rel=1e-4)
 
 
 def test_a_design_on_a_region_holds_all_over_it():

@@ -11,9 +11,11 @@ import typer
 
 from lagros_benchmarks.commands.attack import attack
 from lagros_benchmarks.commands.certify import certify
+from lagros_benchmarks.commands.check import check
 from lagros_benchmarks.commands.data import data
 from lagros_benchmarks.commands.export import export
 from lagros_benchmarks.commands.extras import check_extra
+from lagros_benchmarks.commands.new import new
 from lagros_benchmarks.commands.outputs import check_outputs, policy_files
 from lagros_benchmarks.commands.streams import printing_failed
 from lagros_benchmarks.commands.terminal import (
@@ -310,6 +312,8 @@ def reproduce(
     run_and_report(benchmark, outputs, place / "benchmark", keep=True)
 
 
+app.command(cls=Command)(new)
+app.command(cls=Command)(check)
 app.command(cls=Command)(watch)
 app.command(cls=Command)(export)
 app.command(cls=Command)(certify)

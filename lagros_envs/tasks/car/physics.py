@@ -25,6 +25,10 @@ class Car:
         """Number of controls, 2."""
         return 2
 
+    def energy(self, state: Components, functions: Any) -> Any:
+        """Return the energy of a unit of mass [J/kg]."""
+        return 0.5 * state[3] * state[3]
+
     def derivative(self, state: Components, control: Components, functions: Any) -> Components:
         """Return dx/dt = [v cos theta, v sin theta, omega, a].
 

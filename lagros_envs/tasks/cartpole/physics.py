@@ -68,6 +68,20 @@ class CartPole:
         """Number of controls, 1."""
         return 1
 
+    @property
+    def dissipates(self) -> bool:
+        """Whether friction takes energy."""
+        return self.cart_friction > 0.0 or self.pole_friction > 0.0
+
+    def energy(self, state: Components, functions: Any) -> Any:
+        """Return the energy of cart and pole, a uniform rod [J]."""
+        _, angle, velocity, angular_rate = state
+        cosine, moment = functions.cos(angle), self.pole_mass * self.half_length
+        turning = (4.0 / 3.0) * self.half_length * angular_rate * angular_rate
+        moving = 0.5 * (self.cart_mass + self.pole_mass) * velocity * velocity
+        coupled = cosine * velocity * angular_rate
+        return moving + moment * (coupled + 0.5 * turning + self.gravity * cosine)
+
     def derivative(self, state: Components, control: Components, functions: Any) -> Components:
         """Return dx/dt (Barto et al. 1983, viscous friction in place of its sign).
 

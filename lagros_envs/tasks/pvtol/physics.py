@@ -49,6 +49,12 @@ class Pvtol:
         """Thrust of each rotor that holds a hover [N]."""
         return 0.5 * self.mass * self.gravity
 
+    def energy(self, state: Components, functions: Any) -> Any:
+        """Return the energy [J]."""
+        _, height, _, along, up, rate = state
+        moving = self.mass * (along * along + up * up) + self.inertia * rate * rate
+        return 0.5 * moving + self.mass * self.gravity * height
+
     def derivative(self, state: Components, control: Components, functions: Any) -> Components:
         """Return dx/dt.
 

@@ -52,6 +52,12 @@ class Spacecraft:
         """The same body, driven by a wrench in its own axes."""
         return SpacecraftByWrench(self)
 
+    def energy(self, state: Components, functions: Any) -> Any:
+        """Return the energy, with twice the inertia as in the paper's model [J]."""
+        _, _, _, velocity_x, velocity_y, spin = state
+        moving = 0.5 * self.mass * (velocity_x * velocity_x + velocity_y * velocity_y)
+        return moving + self.inertia * spin * spin
+
     def derivative(self, state: Components, control: Components, functions: Any) -> Components:
         """Return dx/dt.
 
