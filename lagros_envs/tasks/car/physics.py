@@ -15,6 +15,8 @@ class Car:
     State x = [x, y, theta, v] in [m, m, rad, m/s]. Control u = [omega, a] in [rad/s, m/s^2].
     """
 
+    mirror = (1, -1, -1, 1), (-1, 1)
+
     @property
     def state_dim(self) -> int:
         """Number of states, 4."""

@@ -45,6 +45,8 @@ class CartPole:
     pole_friction: float = 0.002
     half_length: float = 0.5
 
+    mirror = (-1, -1, -1, -1), (-1,)
+
     def __post_init__(self) -> None:
         check_fields(self)
         use_plain_numbers(self)
