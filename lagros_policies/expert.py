@@ -65,6 +65,21 @@ class TrackedPlans:
     gains: Any = None
 
 
+class PointwiseLaw(Protocol):
+    """A law that sees nothing of a plan but the target of the moment.
+
+    Attributes:
+        name: Name in tables.
+    """
+
+    name: str
+
+    def __call__(
+        self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
+    ) -> FloatArray:
+        """Return u, shape (s, m), at x (s, n), x_d (s, n) and u_d (s, m)."""
+
+
 class Preference(Protocol):
     """What u* prefers where contraction leaves a choice; built of a task.
 
@@ -164,7 +179,8 @@ class Expert:
         task: The task.
         metric: The contraction metric of the task; its own if left out.
         preference: What "tuned" prefers; the task's if left out.
-        law: One of `LAWS`; if left out, "tuned" with a preference and the shipped one without.
+        law: One of `LAWS`, or a law of the state and the target alone; if left out, "tuned" with a
+            preference and the shipped one without.
         weights: Of a law along a plan; if left out, what it makes of those of the task.
 
     Raises:
@@ -178,15 +194,17 @@ class Expert:
         task: Task,
         metric: ContractionMetric | None = None,
         preference: Preference | None = None,
-        law: str | None = None,
+        law: str | PointwiseLaw | None = None,
         weights: Feedback | None = None,
     ) -> None:
         if law is None:
             law = SHIPPED_LAW if preference is None else "tuned"
-        check_name("law", law, LAWS)
-        self.task, self.law_name = task, law
+        self._pointwise = None if isinstance(law, str) else law
+        if isinstance(law, str):
+            check_name("law", law, LAWS)
+        self.task, self.law_name = task, law if isinstance(law, str) else law.name
         if preference is not None and self.law_name != "tuned":
-            raise ValueError(f"law={law!r} prefers nothing: leave out preference, or law")
+            raise ValueError(f"law={self.law_name!r} prefers nothing: leave out preference, or law")
         self._metric, self._preference = metric, preference
         self.planner = planner_of(task)
         along = _ALONG.get(self.law_name)
@@ -195,7 +213,7 @@ class Expert:
         self._weights = weights if along is None or weights is not None else along(task)
         bounds = np.array([task.control_low, task.control_high], np.float64)
         self._bounds = None if np.all(np.isinf(bounds)) else bounds
-        if self._weights is None:
+        if self._weights is None and self._pointwise is None:
             _ = self.law  # a metric that is missing is said here, not in flight
 
     @cached_property
@@ -235,7 +253,7 @@ class Expert:
             controls: u_d, shape (p, N, m).
             first_step: Control step at which the plans begin.
         """
-        if self.law_name == "least-norm":
+        if self.law_name == "least-norm" or self._pointwise is not None:
             return TrackedPlans(states, controls, first_step)
         period = self.task.control_period
         _, by_state, by_control = linearise_hold(self.task.system, states[:, :-1], controls, period)
@@ -275,6 +293,8 @@ class Expert:
         """Return the law's u whatever the bounds of the control are; see `control`."""
         index = step - plans.first_step
         nominal, nominal_control = plans.states[plan, index], plans.controls[plan, index]
+        if self._pointwise is not None:
+            return self._pointwise(state, nominal, nominal_control)
         error, preferred = state - nominal, np.zeros(len(state))
         if plans.feedback is not None:
             deviation = np.einsum("smi,si->sm", plans.feedback[plan, index], error)

@@ -15,7 +15,7 @@ from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.checks import check_above, check_name, check_not_negative, check_whole, shown
 from lagros_envs.task import Task
 from lagros_policies.contraction import ContractionMetric, load_metric
-from lagros_policies.expert import LAWS, WITHIN_METRIC, Expert, TrackedPlans
+from lagros_policies.expert import LAWS, WITHIN_METRIC, Expert, PointwiseLaw, TrackedPlans
 from lagros_policies.observed import observed_rows
 from lagros_policies.planning import Trajectory
 from lagros_policies.policy import BasePolicy, PolicyState, row_memories
@@ -42,6 +42,7 @@ class TubeMpcState:
         late_plans: Plans that took longer than the deadline; the last one stayed in force.
         newest: Control step of the last call; -1 before the first.
         saturated_steps: Control steps at which u* asked for more than the bounds of the control.
+        fallbacks: Control steps at which the law had no answer of its own, where it may have none.
     """
 
     plan: Trajectory | None = None
@@ -52,6 +53,7 @@ class TubeMpcState:
     late_plans: int = 0
     newest: int = -1
     saturated_steps: int = 0
+    fallbacks: int = 0
 
 
 class TubeMpcPolicy(BasePolicy):
@@ -78,8 +80,8 @@ class TubeMpcPolicy(BasePolicy):
         clock: Source of the time, for tests [s].
         allow_other_settings: Track with the task's own metric also where the system is another than
             that for which it was designed.
-        law: One of `lagros_policies.expert.LAWS`; None for the shipped one, or for "tuned" with a
-            metric.
+        law: One of `lagros_policies.expert.LAWS`, or a law of the state and the target alone; None
+            for the shipped one, or for "tuned" with a metric.
 
     Raises:
         FileNotFoundError: The task's metric has not been made.
@@ -99,14 +101,14 @@ class TubeMpcPolicy(BasePolicy):
         deadline: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
         allow_other_settings: bool = False,
-        law: str | None = None,
+        law: str | PointwiseLaw | None = None,
     ) -> None:
         self.settings = task = task_of(settings)
         if replan_every is not None:
             check_whole("replan_every", replan_every)
         deadline = task.control_period if deadline is None else deadline
         check_above("deadline", deadline, 0)
-        if law is not None:
+        if isinstance(law, str):
             check_name("law", law, LAWS)
         if metric is None:
             if law in WITHIN_METRIC:
@@ -121,8 +123,10 @@ class TubeMpcPolicy(BasePolicy):
             raise ValueError(f"metric={shown(metric)} must be a contraction metric, or its file")
         if not callable(clock):
             raise ValueError(f"clock={shown(clock)} must be a function that returns seconds")
-        if law is not None:
+        if isinstance(law, str):
             self.name = "lqr-plan" if law == "lqr" else f"{self.name}:{law}"
+        elif law is not None:
+            self.name = law.name
         elif metric is not None:
             law = "tuned"
         self.expert = Expert(task, metric, law=law)
@@ -167,10 +171,12 @@ class TubeMpcPolicy(BasePolicy):
         Where the control has bounds, `saturated_steps` are the control steps at which u* asked for
         more.
         """
-        names = ["plans", "failed_plans", "late_plans"]
-        if self._bounded:
-            names.append("saturated_steps")
-        return {name: sum(getattr(memory, name) for memory in state) for name in names}
+        return {name: sum(getattr(memory, name) for memory in state) for name in self._counted}
+
+    @property
+    def _counted(self) -> tuple[str, ...]:
+        names = ("plans", "failed_plans", "late_plans")
+        return (*names, "saturated_steps") if self._bounded else names
 
     def _control(self, row: FloatArray, memory: TubeMpcState) -> FloatArray:
         """Return u*, shape (m,), whatever the bounds of the control are."""
@@ -190,8 +196,13 @@ class TubeMpcPolicy(BasePolicy):
             self._renew(row, asked, step, memory)
         if memory.tracked is None:
             return np.array(task.control_centre, np.float64)
-        state = row[None, layout.state]
-        wanted = self.expert.wanted(memory.tracked, np.zeros(1, int), np.full(1, step), state)
+        return self._wanted(memory.tracked, step, row[layout.state], memory)
+
+    def _wanted(
+        self, tracked: TrackedPlans, step: int, state: FloatArray, memory: TubeMpcState
+    ) -> FloatArray:
+        """Return the law's u, shape (m,), at a state (n,) that follows one plan."""
+        wanted = self.expert.wanted(tracked, np.zeros(1, int), np.full(1, step), state[None])
         control: FloatArray = wanted[0]
         return control
 
@@ -210,7 +221,7 @@ class TubeMpcPolicy(BasePolicy):
         plan, layout = memory.plan, self._layout
         start = self._start(row, step, plan)
         begun = self._clock()
-        renewed = self.planner.plan(start, row[layout.goal], step, plan, layout.discs_of(row))
+        renewed = self._planned(start, row[layout.goal], layout.discs_of(row), step, memory)
         late = self._clock() - begun > self.deadline
         memory.plans += 1
         memory.late_plans += late
@@ -223,6 +234,12 @@ class TubeMpcPolicy(BasePolicy):
         memory.asked = asked
         memory.plan = renewed
         memory.tracked = self.expert.track(renewed.states[None], renewed.controls[None], step)
+
+    def _planned(
+        self, start: FloatArray, goal: FloatArray, discs: FloatArray, step: int, last: TubeMpcState
+    ) -> Trajectory:
+        """Return a plan from a state to the goal at the time limit."""
+        return self.planner.plan(start, goal, step, last.plan, discs)
 
     def _start(self, row: FloatArray, step: int, plan: Trajectory | None) -> FloatArray:
         """Return the state from which to plan, shape (n,)."""

@@ -143,7 +143,7 @@ print(*failed)
 PLANNED = {
     name
     for name in (*NAMES, *SPACECRAFT_NAMES)
-    if name.partition(":")[0] in ("tube-mpc", "lqr-plan", "centralized")
+    if name.partition(":")[0] in ("tube-mpc", "lqr-plan", "sd-lqr", "mpc", "c3m", "centralized")
 }
 
 
