@@ -239,7 +239,8 @@ class TubeMpcPolicy(BasePolicy):
         self, start: FloatArray, goal: FloatArray, discs: FloatArray, step: int, last: TubeMpcState
     ) -> Trajectory:
         """Return a plan from a state to the goal at the time limit."""
-        return self.planner.plan(start, goal, step, last.plan, discs)
+        plan: Trajectory = self.planner.plan(start, goal, step, last.plan, discs)
+        return plan
 
     def _start(self, row: FloatArray, step: int, plan: Trajectory | None) -> FloatArray:
         """Return the state from which to plan, shape (n,)."""
