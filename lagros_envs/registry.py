@@ -48,6 +48,11 @@ def task_named(name: str) -> Described:
     return _FOUND[name]
 
 
+def env_id_of(name: str) -> str:
+    """Return the Gymnasium id of a task that is known by name; it is not imported for it."""
+    return f"lagros/{SHIPPED[name].title}-v0" if name in SHIPPED else _FOUND[name].env_id
+
+
 def called(task: Described) -> str:
     """Return what the command line takes for a task: its name, file, or module:class."""
     if task.name in SHIPPED:
@@ -62,19 +67,25 @@ def called(task: Described) -> str:
     return quote(f"{module}:{type(task).__qualname__}")
 
 
-def find_task(text: str) -> Described:
+def find_task(text: str | Described) -> Described:
     """Return a task by what a user calls it, and register it.
 
     Args:
-        text: A name; one in the entry-point group `lagros.tasks` of an installed package;
-            "module:attribute"; or the path of a file, "./puck.py", or of one with an attribute,
-            "./puck.py:Puck". The file is run. In it the task is `task`, or else the only task.
+        text: A name; the id of its environment, "lagros/Puck-v0"; one in the entry-point group
+            `lagros.tasks` of an installed package; "module:attribute"; or the path of a file,
+            "./puck.py", or of one with an attribute, "./puck.py:Puck". The file is run. In it the
+            task is `task`, or else the only task. A task is taken as it is.
 
     Raises:
         ValueError: There is no such task, or something is wrong with it.
     """
+    if isinstance(text, Described):
+        return text
     if text in task_names():
         return task_named(text)
+    for name in task_names():
+        if text == env_id_of(name):
+            return task_named(name)
     found = _found(text)
     _CALLED[found.name] = text
     return found

@@ -282,7 +282,7 @@ def _places(task: Described) -> dict[str, str]:
 
 
 def make(
-    name: str,
+    name: str | Callable[..., Policy],
     env: Any,
     allow_wrappers: bool = False,
     allow_other_settings: bool = False,
@@ -297,10 +297,10 @@ def make(
 
     Args:
         name: One of `policy_names(task)`; the path of a stable-baselines3 model (`ppo.zip`,
-            `sac:model.zip`); or `module:Class`, a class of your own that is built with the task's
+            `sac:model.zip`); `module:Class`, a class of your own that is built with the task's
             settings (and, where its attribute `prepared` is True, with the bound of the disturbance
-            as `disturbance_bound`). A zip of stable-baselines3 holds pickled code and a module is
-            code: both run, so name only what you trust.
+            as `disturbance_bound`); or such a class itself. A zip of stable-baselines3 holds
+            pickled code and a module is code: both run, so name only what you trust.
         env: A Gymnasium or PettingZoo environment of this package, several in a vector, or the id
             of one; the policy takes its task settings (and preset, and the bound of its
             disturbance) and nothing else.
@@ -322,7 +322,7 @@ def make(
     check_flag("allow_wrappers", allow_wrappers)
     check_flag("allow_other_settings", allow_other_settings)
     world = bare_environment(env, allow_wrappers)
-    if not isinstance(name, str):
+    if not (isinstance(name, str) or callable(name)):
         raise ValueError(f"name={shown(name)} must be text: a name, a path or module:Class")
     if "settings" in settings:
         raise _of_the_environment("settings")
@@ -331,6 +331,8 @@ def make(
     told = named_in(task, "told", None)
     if told is not None:
         settings = told(world, settings)
+    if not isinstance(name, str):
+        return _built(name, world, allow_other_settings, settings)
     if name in classes:
         if task.most_agents == 1 and name in _OTHER_LAWS:
             settings = {"law": _OTHER_LAWS[name], **settings}

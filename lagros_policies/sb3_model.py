@@ -6,13 +6,15 @@ import importlib
 import io
 import zipfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.arrays import BoolArray, Float32Array
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.reading import check_file, parse_json
 from lagros_envs.registry import task_named, task_names
 from lagros_envs.task import Described, Task
@@ -25,6 +27,7 @@ from lagros_policies.room import part_of
 # has less.
 MOST_EXPANDED = 1 << 28
 MOST_ENTRIES = 100
+_LIBRARY = "stable_baselines3.common"
 
 
 class Spaces(NamedTuple):
@@ -48,6 +51,40 @@ def single_spaces(task: Task) -> Spaces:
     return Spaces((task.layout.size,), (task.system.control_dim,), -1.0, f"{task.env_id} has")
 
 
+class Normalisation(NamedTuple):
+    """How `VecNormalize` has shown observations to a model: clip((o - mean) / deviation, +-clip).
+
+    Attributes:
+        mean: Shape (o,).
+        deviation: Likewise.
+        clip: Largest value.
+    """
+
+    mean: FloatArray
+    deviation: FloatArray
+    clip: float
+
+    def seen(self, rows: Float32Array) -> Float32Array:
+        """Return observations (..., o) as the model sees them."""
+        scaled = np.clip((rows - self.mean) / self.deviation, -self.clip, self.clip)
+        return scaled.astype(np.float32)
+
+
+def normalisation_of(wrapper: Any) -> Normalisation | None:
+    """Return how a `VecNormalize` shows observations; None without one, or where it shows them all.
+
+    Raises:
+        ValueError: It normalises observations of several parts, which are none of this package.
+    """
+    if wrapper is None or not wrapper.norm_obs:
+        return None
+    statistics = wrapper.obs_rms
+    if not hasattr(statistics, "mean"):
+        raise ValueError("VecNormalize of observations in several parts: those here are flat")
+    deviation = np.sqrt(statistics.var + wrapper.epsilon)
+    return Normalisation(np.array(statistics.mean), deviation, float(wrapper.clip_obs))
+
+
 class StableBaselines3Policy(BasePolicy):
     """A stable-baselines3 model with the interface and the checks of this package.
 
@@ -56,6 +93,7 @@ class StableBaselines3Policy(BasePolicy):
             one of them, and all share it.
         name: Name in tables.
         settings: The task; None for the paper's.
+        normalisation: How observations were shown to it; None for as they are.
         told: What else the policies of the task are built with, such as a preset.
 
     Raises:
@@ -64,7 +102,12 @@ class StableBaselines3Policy(BasePolicy):
     """
 
     def __init__(
-        self, model: Any, name: str, settings: Described | None = None, **told: Any
+        self,
+        model: Any,
+        name: str,
+        settings: Described | None = None,
+        normalisation: Normalisation | None = None,
+        **told: Any,
     ) -> None:
         task = _usual(told) if settings is None else settings
         wanted: Spaces = part_of(task, "SPACES", "lagros_policies.sb3_model:single_spaces")(
@@ -84,8 +127,14 @@ class StableBaselines3Policy(BasePolicy):
                 f"{np.max(bounds.high):g}; those of the task are from {low:g} to 1. A model that "
                 "was trained behind wrappers cannot be used without them"
             )
+        if normalisation is not None and normalisation.mean.shape != wanted.observation:
+            raise ValueError(
+                f"{name}: observations are normalised by means of shape "
+                f"{normalisation.mean.shape}; {wanted.where} {wanted.observation}"
+            )
         self.name = name
         self.model = model
+        self.normalisation = normalisation
 
     def predict(
         self,
@@ -102,6 +151,8 @@ class StableBaselines3Policy(BasePolicy):
         rows = as_numbers(observation, np.float32)
         if not np.isfinite(rows).all():
             raise ValueError("the observation is not finite")
+        if self.normalisation is not None:
+            rows = self.normalisation.seen(rows)
         action, state = self.model.predict(rows, state, episode_start, deterministic)
         return np.asarray(action, np.float32), state
 
@@ -112,10 +163,46 @@ def _usual(told: Mapping[str, Any]) -> Described:
     return next(task for task in tasks if bool(task.presets) == bool(told))
 
 
+def packed(given: Any, name: str) -> Any:
+    """Return a model of stable-baselines3 as a function that makes a policy of a task.
+
+    It is a copy of what the model is now, without its environment, and travels to other processes;
+    observations are shown to it as the `VecNormalize` of that environment does. Anything else is
+    returned as it is.
+
+    Args:
+        given: The model, or something else.
+        name: Name of the policy in tables.
+
+    Raises:
+        ValueError: As `normalisation_of`.
+    """
+    kinds = [kind for kind in type(given).__mro__ if kind.__module__ == f"{_LIBRARY}.base_class"]
+    if not kinds:
+        return given
+    content = io.BytesIO()
+    given.save(content)
+    normalisation = normalisation_of(given.get_vec_normalize_env())
+    return partial(_unpacked, type(given), content.getvalue(), name, normalisation)
+
+
+def _unpacked(
+    kind: Any,
+    content: bytes,
+    name: str,
+    normalisation: Normalisation | None,
+    settings: Described,
+    **told: Any,
+) -> StableBaselines3Policy:
+    model = kind.load(io.BytesIO(content), device="cpu")
+    return StableBaselines3Policy(model, name, settings, normalisation, **told)
+
+
 def load_stable_baselines3(
     path: Path | str,
     algorithm: str | None = None,
     settings: Described | None = None,
+    vecnormalize: Path | str | None = None,
     **told: Any,
 ) -> StableBaselines3Policy:
     """Load a model saved by stable-baselines3's `model.save(path)`.
@@ -128,7 +215,9 @@ def load_stable_baselines3(
         path: The zip file.
         algorithm: One of `ALGORITHMS`, in any case; None to detect it.
         settings: As for `StableBaselines3Policy`.
-        told: Likewise.
+        vecnormalize: What `VecNormalize.save` has written, where the model was trained behind one.
+            It is a pickle: code, which runs. None looks for no such file.
+        told: As `settings`.
 
     Returns:
         The policy, on the CPU, named after the file.
@@ -157,7 +246,24 @@ def load_stable_baselines3(
             f"{path} could not be loaded as a {chosen} model of stable-baselines3 "
             f"{library.__version__} ({_line(error)})"
         ) from error
-    return StableBaselines3Policy(model, path.stem, settings, **told)
+    normalisation = None if vecnormalize is None else _normalisation_in(vecnormalize, model)
+    return StableBaselines3Policy(model, path.stem, settings, normalisation, **told)
+
+
+def _normalisation_in(path: Path | str, model: Any) -> Normalisation | None:
+    """Return the normalisation of a file, which is unpickled: its author's code runs."""
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    name = check_file(path, MOST_EXPANDED)
+    spaces = gym.Env[Any, Any]()
+    spaces.observation_space, spaces.action_space = model.observation_space, model.action_space
+    try:
+        wrapper = VecNormalize.load(str(path), DummyVecEnv([lambda: spaces]))
+        return normalisation_of(wrapper)
+    except Exception as error:  # a pickle can raise anything
+        raise ValueError(
+            f"{name} is no VecNormalize of this model's observations ({_line(error)})"
+        ) from error
 
 
 def detect_algorithm(path: Path | str) -> str:

@@ -1,15 +1,16 @@
 """Paired episodes, intervals, tables, figures and the command line `lagros`.
 
-`BenchmarkSettings` says what to run, `run_benchmark` runs it, with policies that are built by their
-names or are objects of your own (with `kept_in` it goes on where it was killed), and `summarise`
-turns the episodes into the rows of the published tables. `lagros_benchmarks.commands` is the same
-from a terminal.
+`compare` puts policies beside each other on the same episodes, in one call. `BenchmarkSettings`
+says in full what to run, `run_benchmark` runs it (with `kept_in` it goes on where it was killed),
+and `summarise` turns the episodes into the rows of the published tables.
+`lagros_benchmarks.commands` is the same from a terminal.
 """
 
 import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from lagros_benchmarks.report.comparison import Comparison, compare
     from lagros_benchmarks.report.records import summarise
     from lagros_benchmarks.run.episodes import EpisodeRecord, run_episode
     from lagros_benchmarks.run.runner import BenchmarkRun, kept_in, run_benchmark
@@ -19,8 +20,10 @@ if TYPE_CHECKING:
 __all__ = [
     "BenchmarkRun",
     "BenchmarkSettings",
+    "Comparison",
     "EpisodeRecord",
     "Policy",
+    "compare",
     "kept_in",
     "run_benchmark",
     "run_episode",
@@ -30,8 +33,10 @@ __all__ = [
 _HOMES = {
     "BenchmarkRun": "lagros_benchmarks.run.experiment",
     "BenchmarkSettings": "lagros_benchmarks.run.settings",
+    "Comparison": "lagros_benchmarks.report.comparison",
     "EpisodeRecord": "lagros_benchmarks.run.episodes",
     "Policy": "lagros_policies.policy",
+    "compare": "lagros_benchmarks.report.comparison",
     "kept_in": "lagros_benchmarks.run.runner",
     "run_benchmark": "lagros_benchmarks.run.runner",
     "run_episode": "lagros_benchmarks.run.episodes",

@@ -70,8 +70,11 @@ def test_objects_fly_spacecraft_and_scenes():
 
 
 def test_what_is_no_policy_is_refused_before_the_first_episode(tmp_path):
+    plain = dataclasses.replace(fakes.EASY, make_policy=Toolbox().make_policy)
     with pytest.raises(SetupError, match="'mine' is the class IdlePolicy; it must be an object"):
-        run_benchmark(settings_of("mine"), fakes.EASY, policies={"mine": fakes.IdlePolicy})
+        run_benchmark(
+            settings_of("mine"), plain, policies={"mine": lambda settings: fakes.IdlePolicy}
+        )
     with pytest.raises(SetupError, match="'mine' cannot fly: a object has no method predict"):
         run_benchmark(settings_of("mine"), fakes.EASY, policies={"mine": object()})
     locked = fakes.IdlePolicy()

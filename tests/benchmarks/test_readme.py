@@ -20,13 +20,16 @@ TEXT = README.read_text(encoding="utf-8")
 
 def test_every_block_runs(capsys: pytest.CaptureFixture[str]) -> None:
     blocks = documents.python_blocks(TEXT)
-    assert len(blocks) == 5
+    assert len(blocks) == 6
     names: dict[str, Any] = {}
     for block in blocks:
         exec(block, names)
-    single, many = capsys.readouterr().out.splitlines()
+    single, many, *table = capsys.readouterr().out.splitlines()
     assert single.startswith("True ")
     assert len(many.split(",")) == 6
+
+    assert table[0].startswith("cartpole, uniform disturbance")
+    assert any(line.split()[:2] == ["mine", "100.0"] for line in table)
 
     # The policy of one's own answers one observation, and a batch of them row by row.
     env, envs, lean = names["env"], names["envs"], names["Lean"]
@@ -76,7 +79,7 @@ def test_the_worlds_to_watch_are_what_is_said_of_them(
 
 def test_the_first_half_needs_no_other_extra_than_that_of_the_command_line() -> None:
     blocks, typed = first_half.blocks_and_commands(TEXT)
-    assert len(blocks) == 5
+    assert len(blocks) == 6
     assert {command.words[1] for command in typed} == {
         *("bench", "watch", "attack", "certify", "export")
     }

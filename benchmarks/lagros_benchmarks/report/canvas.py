@@ -10,7 +10,7 @@ import importlib.util
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, overload
 
 import numpy as np
 
@@ -71,8 +71,16 @@ def styles(policies: Sequence[str]) -> dict[str, Style]:
     return {name: _STYLES[name] if name in _STYLES else found[name] for name in policies}
 
 
-def check_figure_path(path: str | Path) -> Path:
-    """Return the path of a figure.
+# What a figure was drawn into: its file, or itself where it has none.
+Drawn: TypeAlias = "Path | Figure"
+
+
+@overload
+def check_figure_path(path: str | Path) -> Path: ...
+@overload
+def check_figure_path(path: str | Path | None) -> Path | None: ...
+def check_figure_path(path: str | Path | None) -> Path | None:
+    """Return the path of a figure; None for one that goes into no file.
 
     Raises:
         ValueError: Its suffix names no format that can be drawn.
@@ -80,6 +88,8 @@ def check_figure_path(path: str | Path) -> Path:
     """
     if importlib.util.find_spec("matplotlib") is None:
         raise ModuleNotFoundError("a figure needs Matplotlib", name="matplotlib")
+    if path is None:
+        return None
     if Path(path).suffix.lower() not in FORMATS:
         raise ValueError(f"figure {str(path)!r} must end in {', '.join(FORMATS)}")
     return Path(path)
@@ -152,8 +162,14 @@ def caption(figure: Figure, text: str) -> None:
     figure.supxlabel(text, fontsize=8, color="#444444", x=0.01, ha="left")
 
 
-def save(figure: Figure, path: Path) -> Path:
-    """Write a figure in the format that its path names, and return the path."""
+@overload
+def save(figure: Figure, path: Path) -> Path: ...
+@overload
+def save(figure: Figure, path: Path | None) -> Drawn: ...
+def save(figure: Figure, path: Path | None) -> Drawn:
+    """Write a figure in the format that its path names, and return the path; itself for None."""
+    if path is None:
+        return figure
     stream = io.BytesIO()
     figure.savefig(stream, format=path.suffix.lower()[1:])
     return write_atomic(path, stream.getvalue())

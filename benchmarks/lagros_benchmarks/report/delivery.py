@@ -14,6 +14,8 @@ from lagros_benchmarks.run.process import undone
 from lagros_benchmarks.run.room import room_of
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from lagros_benchmarks.run.experiment import BenchmarkRun, Row
     from lagros_envs.task import Described
 
@@ -120,7 +122,7 @@ def _draw_scene(run: BenchmarkRun, world: int, path: Path) -> None:
         room_of(run.settings.description).part("scene")(run.settings, world, path)
 
 
-def print_report(rows: Sequence[Row]) -> None:
+def print_report(rows: Sequence[Row], console: Console | None = None) -> None:
     """Print the tables, the paired differences and what raised."""
     from rich.console import Console
     from rich.text import Text
@@ -128,7 +130,7 @@ def print_report(rows: Sequence[Row]) -> None:
     from lagros_benchmarks.report import tables
     from lagros_benchmarks.report.formats import by_condition
 
-    console = Console(highlight=False)
+    console = console or Console(highlight=False)
     for group in by_condition(rows):
         console.print(tables.terminal_table(group))
         if not tables.texts(group[0]).framed(group[0]):

@@ -11,6 +11,7 @@ import numpy as np
 from lagros_benchmarks.report.canvas import (
     BLACK,
     LONGEST_LABEL,
+    Drawn,
     canvas,
     caption,
     check_figure_path,
@@ -35,12 +36,12 @@ if TYPE_CHECKING:
 _LONGEST_LEGEND = 7  # policies that an empty panel has room for
 
 
-def draw(rows: Sequence[Row], path: str | Path) -> Path:
+def draw(rows: Sequence[Row], path: str | Path | None) -> Drawn:
     """Draw the error over time of one condition, or success against the bound of several."""
     return (error_figure if len(by_condition(rows)) == 1 else grid_figure)(rows, path)
 
 
-def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
+def error_figure(rows: Sequence[Row], path: str | Path | None) -> Drawn:
     """Draw the mean tracking error of each policy over time against the paper's tube.
 
     The bands hold 80 % of the episodes. The axis is logarithmic where a mean leaves the paper's
@@ -104,7 +105,7 @@ def error_figure(rows: Sequence[Row], path: str | Path) -> Path:
     return save(figure, path)
 
 
-def grid_figure(rows: Sequence[Row], path: str | Path) -> Path:
+def grid_figure(rows: Sequence[Row], path: str | Path | None) -> Drawn:
     """Draw the success rate of each policy against the bound, one panel per kind."""
     path = check_figure_path(path)
     kinds = list(dict.fromkeys(row["disturbance"] for row in rows))

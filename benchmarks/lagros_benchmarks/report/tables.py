@@ -121,7 +121,7 @@ def error_lines(rows: Sequence[Row], most: int = 5) -> Iterator[str]:
 
 def csv_text(rows: Sequence[Row]) -> str:
     """Return the scalar figures of the rows as CSV, intervals as two columns."""
-    flat = [dict(_scalars(row)) for row in rows]
+    flat = scalar_figures(rows)
     stream = io.StringIO()
     # Rows may differ in what is null: an interval that is none has no two columns.
     names = list(dict.fromkeys(name for row in flat for name in row))
@@ -129,6 +129,11 @@ def csv_text(rows: Sequence[Row]) -> str:
     writer.writeheader()
     writer.writerows(flat)
     return stream.getvalue()
+
+
+def scalar_figures(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return the scalar figures of each row, intervals as two; "" for what is null."""
+    return [dict(_scalars(row)) for row in rows]
 
 
 def _scalars(row: Row) -> Iterator[tuple[str, Any]]:

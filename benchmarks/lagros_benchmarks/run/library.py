@@ -6,10 +6,12 @@ imports only what its chunk needs.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -66,8 +68,8 @@ def building(what: str) -> Iterator[None]:
         raise SetupError.building(what, error) from error
 
 
-def make_policy(name: str, env: Any, settings: Mapping[str, Any]) -> Any:
-    """Build a policy from its name or file."""
+def make_policy(name: Any, env: Any, settings: Mapping[str, Any]) -> Any:
+    """Build a policy from its name, file or class."""
     import lagros_policies
 
     return lagros_policies.make(name, env, **settings)
@@ -145,10 +147,16 @@ class Toolbox:
 
 @dataclass(frozen=True)
 class GivenPolicies:
-    """Makes a policy: a copy of one of some objects, or what its name says otherwise."""
+    """Makes a policy of what a caller has given, or what its name says otherwise.
 
-    objects: Mapping[str, Any]
-    otherwise: Callable[[str, Any, Mapping[str, Any]], Any]
+    Attributes:
+        given: By name, an object with `predict`, of which a copy flies; or what `otherwise` makes a
+            policy of: a class, a function, or another name.
+        otherwise: Makes a policy of one of these, an environment and settings.
+    """
+
+    given: Mapping[str, Any]
+    otherwise: Callable[[Any, Any, Mapping[str, Any]], Any]
 
     def __call__(self, name: str, env: Any, settings: Mapping[str, Any]) -> Any:
         """Make a policy.
@@ -156,8 +164,10 @@ class GivenPolicies:
         Raises:
             ValueError: There are settings for an object.
         """
-        if name not in self.objects:
-            return self.otherwise(name, env, settings)
+        given = self.given.get(name, name)
+        made = isinstance(given, str | partial) or inspect.isclass(given)
+        if made or inspect.isroutine(given):
+            return self.otherwise(given, env, settings)
         if settings:
             raise ValueError(f"policy {name!r} is an object, which is not built with settings")
-        return deepcopy(self.objects[name])
+        return deepcopy(given)

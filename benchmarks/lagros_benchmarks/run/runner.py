@@ -68,8 +68,8 @@ def run_benchmark(
 ) -> BenchmarkRun:
     """Run every policy under every condition on the same episodes.
 
-    Policies are built by their names, or are objects of your own beside them, which are called by
-    the names that you give them in the results:
+    Policies are built by their names, or are your own beside them, which are called by the names
+    that you give them in the results (`lagros_benchmarks.compare` is the same in one call):
 
         settings = BenchmarkSettings(policies=("lqr", "mine"), episodes=20)
         run = run_benchmark(settings, policies={"mine": MyPolicy(gain=2.0)})
@@ -83,10 +83,11 @@ def run_benchmark(
         kept: Has the chunks that an earlier run of the same settings has finished, and takes those
             that this one finishes; see `kept_in`. All but the times is the same with it, to the
             bit.
-        policies: Objects with the `predict` of `Policy`, by name; those that the settings do not
-            name fly after the others. Every chunk of episodes flies a copy (`copy.deepcopy`) as the
-            object is now, and worker processes are sent it by value, so that none sees what another
-            left behind, as if each were built anew.
+        policies: By name, objects with the `predict` of `Policy` (models of stable-baselines3 are
+            some), classes or functions that make one of the task, or names and files of policies;
+            those that the settings do not name fly after the others. Every chunk of episodes flies
+            a copy (`copy.deepcopy`) as the object is now, and worker processes are sent it by
+            value, so that none sees what another left behind, as if each were built anew.
 
     Returns:
         All episodes.
@@ -153,6 +154,7 @@ def _with_policies(
 ) -> tuple[BenchmarkSettings, Toolbox]:
     """Return settings that name all policies and a toolbox that makes them."""
     from lagros_policies.policy import policy_names
+    from lagros_policies.sb3_model import packed
 
     taken = policy_names(settings.description)
     if not isinstance(policies, Mapping):
@@ -164,9 +166,10 @@ def _with_policies(
                 f"policies: {shown(name)} is no name; take text of one line, which does not end in "
                 "+filter"
             )
-        if name in taken:
+        if name in taken and policies[name] != name:
             raise ValueError(f"policies: {name!r} is a policy of this package; take another name")
     names = dict.fromkeys((*settings.policies, *policies))
     before = toolbox or Toolbox()
-    made = replace(before, make_policy=GivenPolicies(policies, before.make_policy))
+    given = {name: packed(policy, name) for name, policy in policies.items()}
+    made = replace(before, make_policy=GivenPolicies(given, before.make_policy))
     return replace(settings, policies=tuple(names)), made

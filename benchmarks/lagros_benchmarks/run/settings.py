@@ -70,7 +70,7 @@ def unknown_name(what: str, given: object, valid: Iterable[str], note: str = "")
     return f"unknown {what} {shown(given)}.{hint} Valid: {', '.join(names)}{note}."
 
 
-def check_policy(name: str, task: str | None = None) -> None:
+def check_policy(name: str, task: str | Described | None = None) -> None:
     """Check that a policy is a name of a task's, the first's if left out, a file or a module:Class.
 
     Raises:
@@ -119,7 +119,7 @@ class BenchmarkSettings:
     """Policies side by side on the same episodes.
 
     Attributes:
-        task: Name of the task, or where it is: module:attribute or a .py file.
+        task: Name of the task, or where it is: module:attribute or a .py file; or the task.
         policies: Names of the task's policies, files of stable-baselines3 models, or module:Class.
         episodes: Episodes of each policy under each condition; worlds, with agents.
         seed: Seed of the run. Its episodes belong to the namespace `EVALUATION` of
@@ -148,7 +148,7 @@ class BenchmarkSettings:
         ValueError: A setting is not valid.
     """
 
-    task: str = field(default_factory=lambda: task_names()[0])
+    task: str | Described = field(default_factory=lambda: task_names()[0])
     policies: tuple[str, ...] = _USUAL.policies
     episodes: int = _USUAL.episodes
     seed: int = 0
@@ -243,7 +243,7 @@ class BenchmarkSettings:
             )
 
     @classmethod
-    def for_task(cls, task: str, **given: Any) -> BenchmarkSettings:
+    def for_task(cls, task: str | Described, **given: Any) -> BenchmarkSettings:
         """Return the settings of a task, with its own defaults for what is None.
 
         Raises:

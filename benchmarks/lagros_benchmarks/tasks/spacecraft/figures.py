@@ -10,6 +10,7 @@ import numpy as np
 
 from lagros_benchmarks.report.canvas import (
     LONGEST_LABEL,
+    Drawn,
     Style,
     canvas,
     caption,
@@ -51,7 +52,7 @@ _EFFORT = _Measure(
 )
 
 
-def draw(rows: Sequence[Row], path: str | Path) -> Path:
+def draw(rows: Sequence[Row], path: str | Path | None) -> Drawn:
     """Draw success and effort against the bound, or success and time against the number of agents.
 
     Where there is one condition, success and effort of each policy are drawn side by side.
@@ -64,7 +65,7 @@ def draw(rows: Sequence[Row], path: str | Path) -> Path:
     return _policy_figure(rows, path)
 
 
-def _sweep_figure(rows: Sequence[Row], path: Path, along: str) -> Path:
+def _sweep_figure(rows: Sequence[Row], path: Path | None, along: str) -> Drawn:
     """Draw success above, and below it effort along the bounds or time along the agents."""
     scale = along == "agents"
     keys = ("disturbance", "bound", "safety_filter") if scale else ("disturbance", "safety_filter")
@@ -126,7 +127,7 @@ def _draw_times(axes: Axes, rows: Sequence[Row]) -> None:
             )
 
 
-def _policy_figure(rows: Sequence[Row], path: Path) -> Path:
+def _policy_figure(rows: Sequence[Row], path: Path | None) -> Drawn:
     """Draw success and effort of each policy under one condition, the filter as a filled mark."""
     policies = list(dict.fromkeys(row["policy"] for row in rows))
     figure, panels = canvas(7.0, 1.2 + 0.45 * len(policies), 1, 2, abscissa=False)
