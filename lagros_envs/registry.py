@@ -18,6 +18,7 @@ from lagros_envs.tasks import SHIPPED, Shipped
 
 ENTRY_POINTS = "lagros.tasks"  # the group in which an installed package names its tasks
 _FOUND: dict[str, Described] = {}
+_FOREIGN: dict[str, Described] = {}  # environments of somebody else's
 _CALLED: dict[str, str] = {}  # what a user called those that are not shipped
 
 
@@ -79,6 +80,27 @@ def find_task(text: str | Described) -> Described:
     Raises:
         ValueError: There is no such task, or something is wrong with it.
     """
+    from lagros_envs.foreign.task import Foreign
+
+    found = find_any(text)
+    if isinstance(found, Foreign):
+        raise ValueError(
+            f"{found.name} is an environment of somebody else's, without plan, goal and metric: "
+            "`lagros bench` and `lagros attack` run there, and nothing else"
+        )
+    return found
+
+
+def find_any(text: str | Described) -> Described:
+    """Return a task as `find_task` does, or an environment of somebody else's.
+
+    Args:
+        text: As for `find_task`; or "gym:ID", an environment of Gymnasium's; where a file or a
+            module is named, there may be a `lagros_envs.Foreign` in it.
+
+    Raises:
+        ValueError: There is none, or something is wrong with it.
+    """
     if isinstance(text, Described):
         return text
     if text in task_names():
@@ -86,6 +108,8 @@ def find_task(text: str | Described) -> Described:
     for name in task_names():
         if text == env_id_of(name):
             return task_named(name)
+    if text in _FOREIGN:
+        return _FOREIGN[text]
     found = _found(text)
     _CALLED[found.name] = text
     return found
@@ -94,6 +118,10 @@ def find_task(text: str | Described) -> Described:
 def _found(text: str) -> Described:
     from importlib.metadata import entry_points
 
+    from lagros_envs.foreign.task import PREFIX, Foreign
+
+    if text.startswith(PREFIX):
+        return _registered(Foreign(text.removeprefix(PREFIX)))
     for point in entry_points(group=ENTRY_POINTS, name=text):
         return _registered(_made(_loaded(point.value), f"the entry point {text!r}"))
     place, colon, attribute = text.rpartition(":")
@@ -170,9 +198,16 @@ def _class_of(task: Described) -> tuple[str, str]:
 
 
 def _registered(task: Described) -> Described:
+    from lagros_envs.foreign.task import Foreign
+
     if _FOUND.get(getattr(task, "name", "")) is task:
         return task
-    return register_task(task) if isinstance(task, Task) else task
+    if isinstance(task, Task):
+        return register_task(task)
+    if isinstance(task, Foreign):
+        _ = task.facts  # it can be made and pushed, or what is wrong is said
+        _FOREIGN[task.name] = task
+    return task
 
 
 def _loaded(text: str) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 from lagros_envs.aliases import moved_names
 from lagros_envs.arrays import BoolArray, Float32Array
 from lagros_envs.checks import check_flag, shown, suggestion
-from lagros_envs.task import Described
+from lagros_envs.task import Described, Task
 from lagros_policies.naming import UserClass, model_file, user_class
 from lagros_policies.room import imported, named_in
 from lagros_policies.wrappers import bare_environment
@@ -278,7 +278,7 @@ def policy_names(task: Described) -> tuple[str, ...]:
 
 def _places(task: Described) -> dict[str, str]:
     """Return where the policies of a task are, by name."""
-    return {**(_SINGLE if task.most_agents == 1 else {}), **named_in(task, "POLICIES", {})}
+    return {**(_SINGLE if isinstance(task, Task) else {}), **named_in(task, "POLICIES", {})}
 
 
 def make(

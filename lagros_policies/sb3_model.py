@@ -36,14 +36,16 @@ class Spaces(NamedTuple):
     Attributes:
         observation: Shape of an observation.
         action: Shape of an action.
-        low: Least entry of an action; the largest is 1.
+        low: Least entry of an action.
         where: Whose they are, for a message.
+        high: Largest entry.
     """
 
     observation: tuple[int, ...]
     action: tuple[int, ...]
-    low: float
+    low: Any
     where: str
+    high: Any = 1.0
 
 
 def single_spaces(task: Task) -> Spaces:
@@ -85,6 +87,17 @@ def normalisation_of(wrapper: Any) -> Normalisation | None:
     return Normalisation(np.array(statistics.mean), deviation, float(wrapper.clip_obs))
 
 
+def limits(space: Any) -> tuple[Any, Any]:
+    """Return the least and the largest entry of an action of a space of Gymnasium's."""
+    if hasattr(space, "low"):
+        return space.low, space.high
+    # Of those that count: from `start`, or from 0, so many.
+    count = np.asarray(getattr(space, "nvec", getattr(space, "n", 0)))
+    start = getattr(space, "start", 0)
+    binary = type(space).__name__ == "MultiBinary"
+    return start, (1 if binary else start + count - 1)
+
+
 class StableBaselines3Policy(BasePolicy):
     """A stable-baselines3 model with the interface and the checks of this package.
 
@@ -120,12 +133,12 @@ class StableBaselines3Policy(BasePolicy):
                 f"{spaces[1]}; {wanted.where} {wanted.observation} and {wanted.action}. A model "
                 "that was trained behind wrappers cannot be used without them"
             )
-        low, bounds = wanted.low, model.action_space
-        if not (np.all(bounds.low == low) and np.all(bounds.high == 1.0)):
+        low, high = limits(model.action_space)
+        if not (np.all(low == wanted.low) and np.all(high == wanted.high)):
             raise ValueError(
-                f"{name} was trained on actions from {np.min(bounds.low):g} to "
-                f"{np.max(bounds.high):g}; those of the task are from {low:g} to 1. A model that "
-                "was trained behind wrappers cannot be used without them"
+                f"{name} was trained on actions from {np.min(low):g} to {np.max(high):g}; those of "
+                f"the task are from {np.min(wanted.low):g} to {np.max(wanted.high):g}. A model "
+                "that was trained behind wrappers cannot be used without them"
             )
         if normalisation is not None and normalisation.mean.shape != wanted.observation:
             raise ValueError(

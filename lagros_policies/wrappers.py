@@ -108,6 +108,9 @@ def bare_environment(env: Any, allow_wrappers: bool = False) -> Any:
         if together is not None:
             return _one_of(type(level).__name__, together, allow_wrappers)
         level = inner
+    if getattr(level, "settings", None) is None:
+        # Somebody else's, which `disturb` has wrapped.
+        raise TypeError(f"there are no policies for {env}; use an environment of lagros_envs")
     if not allow_wrappers:
         _check(level, None)
     return level

@@ -31,12 +31,13 @@ def attack(
         str, typer.Option(metavar="NAME", help="A policy of the task, as for `lagros bench`.")
     ] = "lagros",
     goal: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="What to break: tube (||x - x_d|| over its radius), success, clearance (a fall, a "
-            "collision); of one body also error, the largest ||x - x_d||."
+            "collision); of one body also error, the largest ||x - x_d||; of gym:ID return (the "
+            "least) or termination (the earliest). success if not given, of gym:ID return."
         ),
-    ] = "success",
+    ] = None,
     bound: Annotated[float | None, BOUND] = None,
     episodes: Annotated[
         int | None,
@@ -120,9 +121,9 @@ def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> No
 def _replay(task: str, policy: str, path: Path) -> None:
     from lagros_benchmarks.worst_case.attack import fly_again
     from lagros_benchmarks.worst_case.replay import load_worst_cases
-    from lagros_envs.registry import find_task
+    from lagros_envs.registry import find_any
 
-    described = find_task(task)
+    described = find_any(task)
     try:
         cases = load_worst_cases(path)
         _check_command(cases.command, described.name, policy)
@@ -169,12 +170,18 @@ def summary(row: dict[str, Any]) -> list[str]:
     """Return what an attack came to, in a few lines."""
     worn = "+filter" if row["safety_filter"] else ""
     count = row["episodes"]
+    if row["broken_rate"] is None:
+        broken = "no return counts as broken: the environment names no threshold"
+    else:
+        broken = (
+            f"broken in {100 * row['broken_rate']:.0f} % of the episodes "
+            f"(random disturbance: {100 * row['random_broken_rate']:.0f} %)"
+        )
     lines = [
         f"{row['task']}, {row['policy']}{worn}, goal {row['goal']}, bound {row['bound']:g}: "
         f"{row['flights_per_episode']} flights for each of {count} episodes, "
         f"{row['search_seconds']:.0f} s",
-        f"broken in {100 * row['broken_rate']:.0f} % of the episodes "
-        f"(random disturbance: {100 * row['random_broken_rate']:.0f} %)",
+        broken,
         f"worst score {row['score_worst']:.4g}, median {row['score_median']:.4g} "
         f"(random: worst {row['random_score_worst']:.4g})",
     ]

@@ -55,6 +55,10 @@ app = typer.Typer(
 
 
 TASK = typer.Argument(help="{tasks}; or one of your own: module:attribute, or a .py file.")
+ANY_TASK = typer.Argument(
+    help="{tasks}; or one of your own: module:attribute, or a .py file; or gym:ID, an environment "
+    "of Gymnasium's."
+)
 BACKEND_OPTION = typer.Option(
     help="Where the workers run: loky (this machine), or a cluster of ray or dask."
 )
@@ -77,7 +81,7 @@ def main(
 
 @app.command(cls=Command)
 def bench(
-    task: Annotated[str, TASK],
+    task: Annotated[str, ANY_TASK],
     policies: Annotated[
         str | None,
         typer.Option(
@@ -179,7 +183,7 @@ def bench(
     from lagros_benchmarks.report.delivery import Outputs
     from lagros_benchmarks.run.settings import BenchmarkSettings, check_policy
     from lagros_envs.checks import check_whole
-    from lagros_envs.registry import find_task
+    from lagros_envs.registry import find_any
     from lagros_policies.backends import Backend
     from lagros_policies.naming import listed_names, with_parts
     from lagros_policies.policy import policy_names
@@ -188,7 +192,7 @@ def bench(
     named = None if policies is None else listed_names(policies)
     find_users_modules((task, *(named or ())))
     try:
-        described: Any = find_task(task)
+        described: Any = find_any(task)
         if named is not None and "" in named:
             raise ValueError("--policies: an entry is empty; write them as a,b")
         named = None if named is None else with_parts(named, policy_names(described))

@@ -17,7 +17,7 @@ from lagros_benchmarks.run.experiment import BenchmarkRun, Progress, Row
 from lagros_benchmarks.run.runner import run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings, check_policy
 from lagros_envs.checks import shown
-from lagros_envs.registry import find_task
+from lagros_envs.registry import find_any
 from lagros_envs.task import Described, Task
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def compare(
 
     Args:
         task: A task, its name, the id of its environment ("lagros/Puck-v0"), or a file of a
-            task of your own.
+            task of your own; or "gym:ID", an environment of Gymnasium's.
         policies: By the name that the table shows, each one of
 
             - an object with `predict(observation, state, episode_start, deterministic)`, of which a
@@ -149,7 +149,7 @@ def compare(
         SetupError: A policy, the planner or a metric cannot be built, or a policy cannot fly. What
             a policy raises in an episode is that episode's failure.
     """
-    described = find_task(task)
+    described = find_any(task)
     if isinstance(described, Task) and described is task:
         from lagros_envs.check_task import check_task
 

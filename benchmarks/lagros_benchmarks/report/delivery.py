@@ -64,7 +64,7 @@ class Outputs:
 
         Raises:
             ValueError: A file cannot be written, two are one, a figure has an unknown suffix, or
-                the task has no such scene.
+                the task has no such figure or scene.
         """
         for option in ("--figure", "--scene"):
             path = self._paths[option]
@@ -75,6 +75,8 @@ class Outputs:
                     check_figure_path(path)
                 except ValueError as error:
                     raise ValueError(f"{option}: {error}") from None
+        if self.figure is not None and task is not None and room_of(task).figures is None:
+            raise ValueError(f"--figure: there is no figure of {task.name}; leave it out")
         if self.scene is not None:
             if task is None or room_of(task).scene is None:
                 name = "the task" if task is None else task.name

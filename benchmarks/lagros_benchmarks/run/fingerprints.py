@@ -21,6 +21,7 @@ from lagros_benchmarks.run.library import Toolbox
 from lagros_benchmarks.run.settings import BenchmarkSettings
 from lagros_benchmarks.run.surroundings import machine, threads, versions
 from lagros_envs.dynamics.straight_line import statements, straight_line
+from lagros_envs.foreign import Foreign
 from lagros_envs.numbers import functions
 from lagros_envs.task import Task
 from lagros_policies.naming import is_file, model_file, user_class
@@ -56,7 +57,7 @@ def fingerprint(settings: BenchmarkSettings, toolbox: Toolbox) -> str:
         "parallel": settings.backend.in_parallel(settings.jobs),
         "files": {text: _digest(files) for text, files in _named_files(record)},
         "task": _digest(_task_files(task)),
-        "described": described(task) if isinstance(task, Task) else None,
+        "described": described(task) if isinstance(task, Task) else _plain(repr(task)),
         "code": _own_code(),
         "toolbox": [_origin(value) for value in vars(toolbox).values()],
         "versions": versions(),
@@ -78,16 +79,21 @@ def described(task: Task) -> dict[str, Any]:
     lines, rates = statements(straight_line(equation, names))
     said = {name: repr(getattr(task, name)) for name in _ASKED}
     first = repr(task.sample(np.random.default_rng(0)))
-    # Where an object without a text of its own lies says nothing of it.
-    settings = re.sub(r" at 0x[0-9a-f]+", "", repr(task))
-    return {"settings": settings, "equation": [*lines, *rates], "first": first, **said}
+    return {"settings": _plain(repr(task)), "equation": [*lines, *rates], "first": first, **said}
+
+
+def _plain(text: str) -> str:
+    """Return what an object says of itself without where it lies, which says nothing of it."""
+    return re.sub(r" at 0x[0-9a-f]+", "", text)
 
 
 def _task_files(task: Any) -> list[Path]:
     """Return the files in which a task and its system are described, and its weights."""
     folder = weights_folder(task)
     weights = sorted([folder / "metric.json", *folder.glob(f"{task.name}_*")])
-    kinds = (type(task), type(getattr(task, "system", task)))
+    kinds = [type(task), type(getattr(task, "system", task))]
+    if isinstance(task, Foreign):
+        kinds.append(task.facts.source)
     return [*(path for kind in kinds for path in _python_of(kind)), *weights]
 
 

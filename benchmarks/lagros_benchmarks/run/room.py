@@ -10,6 +10,7 @@ import importlib
 from dataclasses import dataclass
 from typing import Any
 
+from lagros_envs.foreign.task import PREFIX, Foreign
 from lagros_envs.registry import task_named, task_names
 from lagros_envs.task import Described
 
@@ -22,8 +23,8 @@ class Room:
         experiment: An `Experiment`, whose `set_up` takes settings and toolbox.
         records: A module with the figures of its rows, and with its episodes as objects.
         tables: A module with the texts and columns of its tables.
-        figures: Draws rows into a file.
-        scene: Draws what every policy made of one world of a run; None without, as the next.
+        figures: Draws rows into a file; None, as in all that follow, where there is no such thing.
+        scene: Draws what every policy made of one world of a run.
         fly_scene: Flies that world.
         reproduced: Name of the figure of `lagros reproduce`.
         game: What `lagros watch` plays.
@@ -39,22 +40,29 @@ class Room:
     experiment: str = "lagros_benchmarks.run.single:SingleExperiment"
     records: str = "lagros_benchmarks.report.single"
     tables: str = "lagros_benchmarks.report.single_tables"
-    figures: str = "lagros_benchmarks.report.single_figures:draw"
+    figures: str | None = "lagros_benchmarks.report.single_figures:draw"
     scene: str | None = None
     fly_scene: str | None = None
     reproduced: str = "error.png"
-    game: str = "lagros_benchmarks.report.watched:SingleGame"
+    game: str | None = "lagros_benchmarks.report.watched:SingleGame"
     attack: str = "lagros_benchmarks.worst_case.single:SingleBench"
-    guaranteed: str = "lagros_benchmarks.evidence.columns:guaranteed"
-    certify: str = "lagros_benchmarks.evidence.single:certify"
-    certify_metric: str = "lagros_benchmarks.evidence.metric:certify_metric"
-    reproduce: str = "lagros_benchmarks.run.reproduce:ReproduceSettings"
-    train: str = "lagros_benchmarks.training.course:COURSE"
-    demonstrations: str = "lagros_benchmarks.run.demonstrations:SingleExpert"
+    guaranteed: str | None = "lagros_benchmarks.evidence.columns:guaranteed"
+    certify: str | None = "lagros_benchmarks.evidence.single:certify"
+    certify_metric: str | None = "lagros_benchmarks.evidence.metric:certify_metric"
+    reproduce: str | None = "lagros_benchmarks.run.reproduce:ReproduceSettings"
+    train: str | None = "lagros_benchmarks.training.course:COURSE"
+    demonstrations: str | None = "lagros_benchmarks.run.demonstrations:SingleExpert"
 
     def part(self, name: str) -> Any:
-        """Import one of the parts by the name of its attribute."""
-        module, _, attribute = str(getattr(self, name)).partition(":")
+        """Import one of the parts by the name of its attribute.
+
+        Raises:
+            ValueError: There is none.
+        """
+        place = getattr(self, name)
+        if place is None:
+            raise ValueError(f"this task has no part {name!r}")
+        module, _, attribute = str(place).partition(":")
         found = importlib.import_module(module)
         return getattr(found, attribute) if attribute else found
 
@@ -70,6 +78,9 @@ def room_of(task: Described) -> Room:
 def room_named(task: str) -> Room:
     """Return the room of a task by the name that stands in its rows.
 
-    A task that is not known here, of rows that were read from a file, has one body.
+    A task that is not known here, of rows that were read from a file, has one body; an
+    environment of somebody else's says by its name what it is.
     """
+    if task.startswith(PREFIX):
+        return room_of(Foreign(task.removeprefix(PREFIX)))
     return room_of(task_named(task)) if task in task_names() else Room()

@@ -6,6 +6,7 @@ one process runs them or many. What depends on the task is an `Experiment`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -56,7 +57,8 @@ def kept_in(
     """
     check_instance("settings", settings, BenchmarkSettings)
     key = fingerprint(settings, toolbox or Toolbox())
-    return Kept(Path(folder) / f"{settings.description.name}-{key[:16]}", key)
+    name = re.sub(r"[^\w.-]", "-", settings.description.name)
+    return Kept(Path(folder) / f"{name}-{key[:16]}", key)
 
 
 def run_benchmark(

@@ -18,9 +18,9 @@ from lagros_envs.checks import (
     suggestion,
 )
 from lagros_envs.disturbances import KINDS
-from lagros_envs.registry import find_task, task_names
+from lagros_envs.registry import find_any, task_names
 from lagros_envs.seeding import EVALUATION, episode_seeds
-from lagros_envs.task import Defaults, Described
+from lagros_envs.task import Defaults, Described, Task
 from lagros_policies.backends import LOKY, Backend
 
 CHANNELS = ("all", "rates")
@@ -79,7 +79,7 @@ def check_policy(name: str, task: str | Described | None = None) -> None:
     from lagros_policies.naming import is_file, is_importable, model_file, user_class
     from lagros_policies.policy import policy_names
 
-    names = policy_names(find_task(task or task_names()[0]))
+    names = policy_names(find_any(task or task_names()[0]))
     if name in names:
         return
     model = model_file(name)
@@ -194,6 +194,8 @@ class BenchmarkSettings:
                 f"guarantee=True is about episodes that begin on their plan; leave it out, or "
                 f"initial_error={self.initial_error:g}"
             )
+        if not isinstance(task, Task):
+            self._check_unplanned(task)
         if task.most_agents > 1:
             self._check_worlds(task)
         self._check_policy_settings()
@@ -205,7 +207,7 @@ class BenchmarkSettings:
         Raises:
             ValueError: There is no such task.
         """
-        return find_task(self.task)
+        return find_any(self.task)
 
     def _check_policy_settings(self) -> None:
         given = self.policy_settings
@@ -222,18 +224,14 @@ class BenchmarkSettings:
         if strangers:
             raise ValueError(f"policy_settings names {strangers}, which do not run")
 
-    def _check_worlds(self, task: Described) -> None:
+    def _check_unplanned(self, task: Described) -> None:
+        """Check what is said of one plan that all policies share."""
         for name in ("guarantee", "initial_error"):
             if getattr(self, name):
                 raise ValueError(
-                    f"{name}={getattr(self, name)} is for one body; leave it out for {task.name}"
+                    f"{name}={getattr(self, name)} is for one body that has a plan; leave it out "
+                    f"for {task.name}"
                 )
-        if self.preset not in task.presets:
-            raise ValueError(unknown_name("preset", self.preset, task.presets))
-        if self.safety_filter not in SAFETY_FILTERS:
-            raise ValueError(unknown_name("safety filter", self.safety_filter, SAFETY_FILTERS))
-        for count in self.agents:
-            check_whole("agents", count, 1, task.most_agents)
         if "worst" in self.disturbances:
             raise ValueError(
                 "disturbance 'worst' pushes away from one nominal trajectory that all policies "
@@ -242,6 +240,14 @@ class BenchmarkSettings:
                 f"{', '.join(kind for kind in KINDS if kind != 'worst')}."
             )
 
+    def _check_worlds(self, task: Described) -> None:
+        if self.preset not in task.presets:
+            raise ValueError(unknown_name("preset", self.preset, task.presets))
+        if self.safety_filter not in SAFETY_FILTERS:
+            raise ValueError(unknown_name("safety filter", self.safety_filter, SAFETY_FILTERS))
+        for count in self.agents:
+            check_whole("agents", count, 1, task.most_agents)
+
     @classmethod
     def for_task(cls, task: str | Described, **given: Any) -> BenchmarkSettings:
         """Return the settings of a task, with its own defaults for what is None.
@@ -249,7 +255,7 @@ class BenchmarkSettings:
         Raises:
             ValueError: A setting is not valid.
         """
-        usual = find_task(task).defaults
+        usual = find_any(task).defaults
         chosen = {name: value for name, value in given.items() if value is not None}
         # A comparison of numbers of agents has no use for a sweep over bounds.
         bounds = (usual.bound,) if len(chosen.get("agents", ())) > 1 else usual.bounds

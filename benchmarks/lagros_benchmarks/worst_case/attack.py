@@ -25,11 +25,13 @@ from lagros_envs.checks import (
     check_whole,
 )
 from lagros_envs.reading import Record
-from lagros_envs.registry import find_task, first_task
+from lagros_envs.registry import find_any, first_task
 from lagros_envs.seeding import episode_seeds
 
 Progress = Callable[[str], None]
 
+# What is to be broken where nothing is said.
+_GOAL = "success"
 # Kind of the random disturbance that the worst case is held against.
 _BASELINE = "uniform"
 # A sequence may pass its bound by rounding alone.
@@ -43,7 +45,8 @@ class AttackSettings:
     Attributes:
         task: As in `lagros attack TASK`.
         policy: As `lagros bench` takes it.
-        goal: What to break: "tube", "success" or "clearance"; of one body also "error".
+        goal: What to break: "tube", "success" or "clearance"; of one body also "error"; of an
+            environment of somebody else's "return" or "termination".
         bound: d_bar, in units of the state per second.
         episodes: Episodes, each with a worst disturbance of its own.
         seed: Seed of the run; its episodes belong to the namespace `ATTACK`.
@@ -69,7 +72,7 @@ class AttackSettings:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        find_task(self.task)
+        find_any(self.task)
         check_policy(self.policy, self.task)
         check_name("goal", self.goal, bench_of(self.task).goals)
         check_positive("bound", self.bound)
@@ -83,15 +86,21 @@ class AttackSettings:
     @classmethod
     def for_task(cls, task: str, method: str, budget: int | None, **given: Any) -> AttackSettings:
         """Return the settings of a task, with its own defaults for what is None."""
-        described = find_task(task)
+        described = find_any(task)
         usual = described.defaults
+        bench = bench_of(described.name)
         search = SearchSettings(
             method,
             budget=usual.attack_budget if budget is None else budget,
-            population=bench_of(described.name).population,
+            population=bench.population,
         )
         chosen = {name: value for name, value in given.items() if value is not None}
-        defaults = {"bound": usual.bound, "episodes": usual.attack_episodes}
+        goal = _GOAL if _GOAL in bench.goals else bench.goals[0]
+        defaults: dict[str, Any] = {
+            "bound": usual.bound,
+            "episodes": usual.attack_episodes,
+            "goal": goal,
+        }
         return cls(task=described.name, search=search, **(defaults | chosen))
 
     def episode_seeds(self) -> list[int]:
@@ -109,7 +118,7 @@ class Attack:
 
 def bench_of(task: str) -> Any:
     """Return what a task brings to an attack: `SingleBench`, or a class like it of its room."""
-    return room_of(find_task(task)).part("attack")
+    return room_of(find_any(task)).part("attack")
 
 
 def run_attack(settings: AttackSettings, progress: Progress | None = None) -> Attack:
