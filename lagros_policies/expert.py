@@ -143,6 +143,12 @@ class Regulator:
         return wanted[:, 0] if wanted.shape[-1] == 1 else wanted
 
 
+def has_metric(task: Task) -> bool:
+    """Return whether a task has a contraction metric, or describes the one that it is to have."""
+    made = shipped_file(task, "metric.json").is_file()
+    return task.metric is not None or task.room is not None or made
+
+
 def metric_of(task: Task) -> ContractionMetric:
     """Read the metric that was made for a task.
 
@@ -150,8 +156,7 @@ def metric_of(task: Task) -> ContractionMetric:
         FileNotFoundError: None has been made.
         ValueError: The task describes none, or the file is damaged or of another system.
     """
-    made = shipped_file(task, "metric.json").is_file()
-    if task.metric is None and task.room is None and not made:
+    if not has_metric(task):
         raise ValueError(
             f"{task.name} has no contraction metric: describe one in its class by `metric = "
             f"MetricDesign(...)`, and make it by `{reproducing(task)}`"
@@ -215,6 +220,11 @@ class Expert:
         self._bounds = None if np.all(np.isinf(bounds)) else bounds
         if self._weights is None and self._pointwise is None:
             _ = self.law  # a metric that is missing is said here, not in flight
+
+    @property
+    def has_metric(self) -> bool:
+        """Whether `metric` is there, or is still to be made as the task describes it."""
+        return self._metric is not None or has_metric(self.task)
 
     @cached_property
     def metric(self) -> ContractionMetric:

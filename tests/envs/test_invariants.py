@@ -3,42 +3,21 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lagros_envs import find_task
 from lagros_envs.dynamics import hold_step
 from lagros_envs.dynamics.invariants import ROUNDING, energy_balance, mirrored
 from lagros_envs.numbers import functions
-from lagros_envs.registry import task_named
-from lagros_envs.tasks import SHIPPED
+from tests.found import TASKS, named, task_of
 
-ROOT = Path(__file__).parents[2]
-EXAMPLES = sorted(
-    path for path in (ROOT / "examples").glob("*.py") if "(Task)" in path.read_text("utf-8")
-)
-TASKS = [*SHIPPED, *map(str, EXAMPLES)]
 # Why a system that is found has no energy.
-WITHOUT: dict[str, str] = {}
-
-
-def found(text):
-    return find_task(text) if text.endswith(".py") else task_named(text)
-
-
-def system_of(text):
-    task = found(text)
-    return task.system if hasattr(task, "system") else task.body
+WITHOUT = {"pendulum": "the example shows the least that a system needs"}
 
 
 def drawn(system, count, seed):
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, system.state_dim))
-
-
-def named(texts):
-    return [pytest.param(text, id=Path(text).stem) for text in texts]
 
 
 def gained_energy(system, states, controls):
@@ -53,8 +32,8 @@ def gained_energy(system, states, controls):
 @pytest.mark.parametrize("text", named(TASKS))
 def test_the_energy_of_every_system_is_kept_or_falls_without_control(text):
     """At every state, by exact slopes; and along flights, by integration in small steps."""
-    system = system_of(text)
-    name = found(text).name
+    task = task_of(text)
+    system, name = task.system, task.name
     assert (name in WITHOUT) == (not hasattr(system, "energy")), "state an energy, or why not"
     if name in WITHOUT:
         pytest.skip(WITHOUT[name])
@@ -76,7 +55,7 @@ def test_the_energy_of_every_system_is_kept_or_falls_without_control(text):
 
 @pytest.mark.parametrize("text", named(TASKS))
 def test_mirror_images_that_are_stated_hold(text):
-    system = system_of(text)
+    system = task_of(text).system
     if not hasattr(system, "mirror"):
         pytest.skip("none is stated")
     states = drawn(system, 100, 2)

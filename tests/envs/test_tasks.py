@@ -11,17 +11,20 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from lagros_envs import Task, find_task
+from lagros_envs import find_task
 from lagros_envs.env import TaskEnv
 from lagros_envs.rules import StepRules
-from lagros_envs.tasks import SHIPPED
 from lagros_envs.vector import TaskVectorEnv
+from tests.found import SINGLE_BODY, task_of
 
 FILE = Path(__file__).parent / "files" / "puck.py"
 PUCK = find_task(str(FILE))
 SWING = find_task(str(FILE.with_name("swing.py")))
-NAMES = [*(name for name in SHIPPED if isinstance(find_task(name), Task)), "puck", "swing"]
-TASKS = {name: find_task(name) for name in NAMES}
+TASKS = {(task := task_of(text)).name: task for text in SINGLE_BODY} | {
+    "puck": PUCK,
+    "swing": SWING,
+}
+NAMES = list(TASKS)
 # Two that stand still in the way, and room for a third.
 DISCS = [[1.0, 0.0, 0.2], [2.0, 1.0, 0.3]]
 

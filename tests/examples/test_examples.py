@@ -12,6 +12,7 @@ import pytest
 
 from lagros_policies.contraction import Basis, BoxRegion, CvStemSettings, design_metric
 from lagros_policies.export import check as check_export
+from tests import found
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -45,7 +46,8 @@ def check(before, after, returns, episodes):
 
 
 def test_every_example_is_tested_and_says_how_it_is_run():
-    names = sorted(path.stem for path in EXAMPLES.glob("*.py"))
+    # Those that hold a task are walked with every other task.
+    names = sorted(path.stem for path in EXAMPLES.glob("*.py") if path not in found.EXAMPLES)
     assert names == [
         "cleanrl_ppo_cartpole",
         "metric_in_cvxpy",

@@ -23,10 +23,9 @@ from lagros_envs.numbers import functions
 from lagros_envs.seeding import episode_streams
 from lagros_envs.sweep import closest_approach
 from lagros_envs.task import LARGEST_DISTANCE, Scenario, Task, distance_between
-from lagros_policies.expert import Expert
+from lagros_policies.expert import Expert, has_metric
 from lagros_policies.planning.planner import Planner, planner_of
 from lagros_policies.planning.trajectory import Trajectory
-from lagros_policies.room import shipped_file
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
 # (states (b, n), episodes (b,), steps (b,)) -> controls (b, m).
@@ -109,10 +108,7 @@ def expert_of(task: Task) -> Expert | Planning:
     Raises:
         FileNotFoundError: Its metric has not been made.
     """
-    made = shipped_file(task, "metric.json").is_file()
-    if task.metric is None and task.room is None and not made:
-        return Planning(task, planner_of(task))
-    return Expert(task)
+    return Expert(task) if has_metric(task) else Planning(task, planner_of(task))
 
 
 def plan_of(planner: Planner, scenario: Scenario) -> Trajectory:

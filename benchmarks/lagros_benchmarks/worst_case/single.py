@@ -191,7 +191,8 @@ class SingleBench:
             # A plan that comes late on a busy machine must not change the figure.
             self.policy.deadline = math.inf
         self.episodes = draw_episodes(self.expert, self.settings.episode_seeds())
-        if self.expert.metric is not None:
+        self.metric = self._metric(say)
+        if self.metric is not None:
             self._tracked = self.expert.track(self.episodes.plans, self.episodes.controls)
 
     def _expert(self, say: Callable[[str], None]) -> Expert | Planning:
@@ -201,6 +202,16 @@ class SingleBench:
         except FileNotFoundError as error:
             say(f"without u* to hold the flights against: {error}")
             return Planning(self.task, planner_of(self.task))
+
+    def _metric(self, say: Callable[[str], None]) -> Any:
+        """Return the metric that flights are held against; None where there is none."""
+        if isinstance(self.expert, Planning) or not self.expert.has_metric:
+            return None
+        try:
+            return self.expert.metric
+        except FileNotFoundError as error:
+            say(f"without a metric to hold the flights against: {error}")
+            return None
 
     def search(self, say: Callable[[str], None]) -> list[Found]:
         """Search the worst sequence of every episode."""
@@ -212,7 +223,7 @@ class SingleBench:
             tracked or policy_law(self.policy, self.episodes),
             self.settings.goal,
             self.settings.bound,
-            None if self.expert.metric is None else energy_adversary(self.expert.metric),
+            None if self.metric is None else energy_adversary(self.metric),
         )
         return search(target, self.settings.search, self.settings.seed)
 
@@ -228,7 +239,7 @@ class SingleBench:
             outcome, flight = replay_single(self.episodes, index, self.policy, goal, one)
             if flight is not None:
                 measures = {**outcome.measures, **self.measures(flight)}
-                if self.expert.metric is not None:
+                if self.metric is not None:
                     measures |= self.of_theorem_one(index, flight)
                 outcome = replace(outcome, measures=measures)
             outcomes.append(outcome)
@@ -242,7 +253,7 @@ class SingleBench:
         """
         plans, controls = self.episodes.plans[[index]], self.episodes.controls[[index]]
         controls = np.concatenate([controls, controls[:, -1:]], axis=1)
-        inside = self.expert.metric.region.contains(flight.states, plans, controls) & flight.alive
+        inside = self.metric.region.contains(flight.states, plans, controls) & flight.alive
         steps = np.flatnonzero(np.logical_and.accumulate(inside[0])[:-1])
         error = 0.0
         if len(steps):
