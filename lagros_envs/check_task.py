@@ -186,9 +186,11 @@ def _check_ranges(task: Task) -> None:
     check_whole("most_discs", task.most_discs, 0, 1000)
     for name in ("alive_bonus", "distance_weight", "success_bonus", "effort_weight"):
         check_not_negative(name, getattr(task, name))
-    if len(task.position) not in (0, 2):
-        raise ValueError(f"position={task.position!r} must be two indices of states, or ()")
-    if task.most_discs and not task.position:
+    if len(task.position) not in (0, 2, 3):
+        raise ValueError(
+            f"position={task.position!r} must be two or three indices of states, or ()"
+        )
+    if task.most_discs and len(task.position) != 2:
         raise ValueError(
             f"most_discs={task.most_discs} needs position, the two states that discs meet"
         )
@@ -327,6 +329,9 @@ def _check_rules(task: Task, title: str, scenarios: list[Scenario]) -> None:
 
 def _check_observed(task: Task, scenarios: list[Scenario]) -> None:
     for scenario in scenarios:
+        place = np.shape(task.place(scenario.initial_state))
+        if place not in ((0,), (2,)):
+            raise ValueError(f"place(state) has shape {place}; it must be (2,), or (0,) for none")
         for polygon in task.outline(scenario.initial_state):
             if np.asarray(polygon).ndim != 2 or np.asarray(polygon).shape[1] != 2:
                 raise ValueError("outline(state) must give polygons, each of shape (corners, 2)")

@@ -1,8 +1,9 @@
-"""Drawing of any task whose body has a position in a plane, with pygame, imported when needed."""
+"""Drawing of any task whose body has a place in a plane, with pygame, imported when needed."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -69,6 +70,28 @@ class Frame:
         return self.disturbance / bound if bound > 0.0 else np.zeros(len(self.state))
 
 
+def rotor_outline(place: FloatArray, tilt: float, half: float) -> list[FloatArray]:
+    """Return a rod with a rotor at each end, seen from the side, as three polygons [m].
+
+    Args:
+        place: Its middle, shape (2,) [m].
+        tilt: Of the rod from the horizontal, to the left [rad].
+        half: Half of its length [m].
+    """
+    along = np.array([math.cos(tilt), math.sin(tilt)])
+    across = np.array([-along[1], along[0]])
+    parts = [(-half, half, -0.02, 0.02), (-half, -0.05, 0.04, 0.06), (0.05, half, 0.04, 0.06)]
+    return [
+        np.stack(
+            [
+                place + x * along + y * across
+                for x, y in ((left, low), (right, low), (right, high), (left, high))
+            ]
+        )
+        for left, right, low, high in parts
+    ]
+
+
 class Renderer(Protocol):
     """What draws the environment of a task."""
 
@@ -83,8 +106,8 @@ class PlaneRenderer(Canvas):
     """Draws body, goal, discs, nominal and disturbance in the plane, and the distance over time.
 
     The body is `task.outline`, or a disc with a mark where it is heading, as far as it moves. The
-    view holds everything there is in the episode. A task without a position shows its coordinates
-    as numbers, and the plot.
+    view holds everything there is in the episode. A task without a place shows its coordinates as
+    numbers, and the plot.
 
     Args:
         task: The task.
@@ -111,7 +134,7 @@ class PlaneRenderer(Canvas):
             self._history.pop()  # a new episode, or a frame redrawn
         self._history.append(replace(frame, state=np.array(frame.state)))
         self._clear()
-        if self._task.position:
+        if self._place(frame.state).size:
             self._look(frame)
             self._draw_plane(frame)
         panel = self._pygame.Rect(0, 0, PANEL * OVERSAMPLING, HEIGHT * OVERSAMPLING)
@@ -127,6 +150,8 @@ class PlaneRenderer(Canvas):
         places = [self._place(one.state) for one in self._history]
         places += [self._place(frame.goal)]
         places += [] if frame.nominal is None else [self._place(frame.nominal)]
+        for corners in self._task.outline(frame.state):
+            places += [*corners]
         low, high = np.min(places, axis=0), np.max(places, axis=0)
         for x, y, radius in frame.discs:
             low = np.minimum(low, (x - radius, y - radius))
@@ -137,7 +162,7 @@ class PlaneRenderer(Canvas):
         self._centre = 0.5 * (low + high)
 
     def _place(self, state: FloatArray) -> FloatArray:
-        return state[list(self._task.position)]
+        return self._task.place(state)
 
     def _point(self, place: FloatArray) -> Point:
         across, up = self._scale * (np.asarray(place) - self._centre)
@@ -169,10 +194,11 @@ class PlaneRenderer(Canvas):
         if frame.nominal is not None:
             self._draw_body(frame.nominal, mix(PURPLE, 0.6), ghost=True)
         self._draw_body(frame.state, BLUE, ghost=False)
-        push = frame.share[list(self._task.position)]
-        self._draw_push(frame, push, BLACK)
-        if len(self._task.rates) == 2:
-            self._draw_push(frame, frame.share[list(self._task.rates)], VERMILLION)
+        places, rates = self._task.position, self._task.rates
+        if places:
+            self._draw_push(frame, frame.share[list(places[:2])], BLACK)
+        if places and len(rates) == len(places):
+            self._draw_push(frame, frame.share[list(rates[:2])], VERMILLION)
 
     def _draw_push(self, frame: Frame, share: FloatArray, colour: Colour) -> None:
         start = self._point(self._place(frame.state))

@@ -168,7 +168,8 @@ class Task(Described):
         state_scale: How far each coordinate typically moves, shape (n,); () for ones.
         control_spread: How far each control typically moves in a plan, shape (m,); () for ones.
         goal_radius: How near the goal counts as success.
-        position: The two coordinates that are the position; () where the body has none in a plane.
+        position: The coordinates that are the position: two in a plane, as discs ask for, or three
+            in space, of which a picture shows the first two; () where it is no coordinates.
         body_radius: Of the body around its position [m].
         most_discs: Discs that an observation has room for.
         margin: Room that a plan keeps beside body and disc [m].
@@ -321,6 +322,10 @@ class Task(Described):
         from lagros_envs.draw import PlaneRenderer
 
         return PlaneRenderer(self, render_mode, fps)
+
+    def place(self, state: FloatArray) -> FloatArray:
+        """Return where its picture has the body, shape (2,) [m]; shape (0,) for no such picture."""
+        return state[list(self.position[:2])]
 
     def outline(self, state: FloatArray) -> Sequence[FloatArray]:
         """Return the body as closed polygons (corners, 2) [m], for its picture; () for a disc."""

@@ -38,4 +38,9 @@ SHIPPED = {
     ),
     "pvtol": Shipped("lagros_envs.tasks.pvtol.task:PvtolSettings", "Pvtol", 60),
     "car": Shipped("lagros_envs.tasks.car.task:CarSettings", "Car", 60),
+    "quadrotor": Shipped("lagros_envs.tasks.quadrotor.task:QuadrotorSettings", "Quadrotor", 60),
+    "quadrotor-10": Shipped(
+        "lagros_envs.tasks.quadrotor.task:HeadingQuadrotorSettings", "Quadrotor10", 60
+    ),
+    "arm": Shipped("lagros_envs.tasks.arm.task:ArmSettings", "Arm", 40),
 }

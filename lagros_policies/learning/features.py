@@ -199,6 +199,7 @@ class Usual:
         self.task, self._discs = task, task.most_discs if task.position else 0
         self.alike = Alike(self._discs, len(_DISC)) if self._discs else None
         names = task.state_names or tuple(f"x{index}" for index in range(n))
+        self._plane = len(task.position) == 2
         self._placed = task.position or tuple(range(n))
         self._others = tuple(index for index in range(n) if index not in self._placed)
         self._angles = tuple(index for index in range(n) if names[index].endswith("[rad]"))
@@ -209,7 +210,7 @@ class Usual:
             *(f"{names[index]} of the goal" for index in self._others),
             *(f"{part} {names[index]}" for index in self._angles for part in ("sin", "cos")),
             "time left [s]",
-            *(_MOTION if task.position else ()),
+            *(_MOTION if self._plane else ()),
             *(f"{part} of disc {disc}" for disc in range(self._discs) for part in _DISC),
         )
 
@@ -223,7 +224,7 @@ class Usual:
         for index in self._angles:
             features += [functions.sin(state[index]), functions.cos(state[index])]
         features.append(task.time_limit - observation[layout.time])
-        if task.position:
+        if self._plane:
             rates = task.system.derivative(state, task.control_centre, functions)
             way, motion = features[:2], [rates[index] for index in task.position]
             (ahead, distance), (course, speed) = (_unit(one, functions) for one in (way, motion))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lagros_envs.arrays import FloatArray
+from lagros_envs.draw import rotor_outline
 from lagros_envs.task import Defaults, Feedback, Learning, MetricDesign, Scenario, Task
 from lagros_envs.tasks.pvtol.physics import Pvtol
 
@@ -118,17 +119,4 @@ class PvtolSettings(Task):
 
     def outline(self, state: FloatArray) -> Sequence[FloatArray]:
         """Return the rod and the two rotors, within the circle that collides."""
-        place, roll = state[:2], state[2]
-        along = np.array([math.cos(roll), math.sin(roll)])
-        across = np.array([-along[1], along[0]])
-        half = self.body_radius
-        parts = [(-half, half, -0.02, 0.02), (-half, -0.05, 0.04, 0.06), (0.05, half, 0.04, 0.06)]
-        return [
-            np.stack(
-                [
-                    place + x * along + y * across
-                    for x, y in ((left, low), (right, low), (right, high), (left, high))
-                ]
-            )
-            for left, right, low, high in parts
-        ]
+        return rotor_outline(state[:2], float(state[2]), self.body_radius)

@@ -1,0 +1,1 @@
+"""The arm of two links in a vertical plane."""
