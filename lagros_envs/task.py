@@ -141,7 +141,7 @@ class Described:
     room: str | None = None
     defaults = Defaults()
     most_agents = 1
-    presets: tuple[str, ...] = ()
+    presets: ClassVar[tuple[str, ...]] = ()
 
     @property
     def env_id(self) -> str:

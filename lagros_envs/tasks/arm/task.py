@@ -85,7 +85,7 @@ class ArmSettings(Task):
         start[:2] = upright + rng.uniform(-_BESIDE, _BESIDE, 2)
         while True:
             goal[:2] = upright + rng.uniform(-1.0, 1.0, 2) * _REACH
-            if self.goal_distance(start, goal, np) >= _WAY:
+            if self.goal_distance(start.tolist(), goal.tolist(), np) >= _WAY:
                 return Scenario(start, goal)
 
     def tip(self, state: Sequence[Any], functions: Any) -> tuple[Any, Any]:

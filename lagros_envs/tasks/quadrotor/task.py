@@ -16,6 +16,7 @@ from lagros_envs.task import (
     Feedback,
     Learning,
     MetricDesign,
+    Numbers,
     Scenario,
     Task,
     distance_between,
@@ -57,18 +58,19 @@ class QuadrotorSettings(Task):
 
     name, title = "quadrotor", "Quadrotor"
     presets: ClassVar[tuple[str, ...]] = ("9", "10")
-    state_names = (
+    state_names: ClassVar[tuple[str, ...]] = (
         *("p_x [m]", "p_y [m]", "p_z [m]", "v_x [m/s]", "v_y [m/s]", "v_z [m/s]"),
         *("tau [-]", "phi [rad]", "theta [rad]"),
     )
-    control_names = ("dtau/dt [1/s]", "dphi/dt [rad/s]", "dtheta/dt [rad/s]")
+    control_names: ClassVar[tuple[str, ...]] = ("dtau/dt [1/s]", "dphi/dt [rad/s]", "dtheta/dt [rad/s]")
     rates = (3, 5, 4)
-    state_low = (-_FAR, -_FAR, -_FAR, -_SPEED, -_SPEED, -_SPEED, 0.5, -_TILT, -_TILT)
-    state_high = (_FAR, _FAR, _FAR, _SPEED, _SPEED, _SPEED, 2.0, _TILT, _TILT)
-    state_scale = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.1, 0.1, 0.1)
-    control_low, control_high = (-5.0, -5.0, -5.0), (5.0, 5.0, 5.0)
-    control_scale = (5.0, 5.0, 5.0)
-    control_spread = (0.1, 0.1, 0.1)
+    state_low: ClassVar[Numbers] = (-_FAR, -_FAR, -_FAR, -_SPEED, -_SPEED, -_SPEED, 0.5, -_TILT, -_TILT)
+    state_high: ClassVar[Numbers] = (_FAR, _FAR, _FAR, _SPEED, _SPEED, _SPEED, 2.0, _TILT, _TILT)
+    state_scale: ClassVar[Numbers] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.1, 0.1, 0.1)
+    control_low: ClassVar[Numbers] = (-5.0, -5.0, -5.0)
+    control_high: ClassVar[Numbers] = (5.0, 5.0, 5.0)
+    control_scale: ClassVar[Numbers] = (5.0, 5.0, 5.0)
+    control_spread: ClassVar[Numbers] = (0.1, 0.1, 0.1)
     goal_radius = 0.3
     position = (0, 2, 1)  # the picture is the view from the side
     body_radius = 0.2
@@ -117,7 +119,7 @@ class QuadrotorSettings(Task):
 class HeadingQuadrotorSettings(QuadrotorSettings):
     """The preset "10": the goal has a heading, too, and distance and success count it [m, rad]."""
 
-    system: Quadrotor = field(default_factory=HeadingQuadrotor)
+    system: HeadingQuadrotor = field(default_factory=HeadingQuadrotor)
 
     name, title = "quadrotor-10", "Quadrotor10"
     presets = ()
