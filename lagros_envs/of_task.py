@@ -12,12 +12,11 @@ from gymnasium import spaces
 
 from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.checks import check_instance
-from lagros_envs.conventions import settings_of
 from lagros_envs.disturbances import Disturbance, channel_mask
 from lagros_envs.numbers import functions
 from lagros_envs.numbers.functions import where
 from lagros_envs.options import nominal_option, option_numbers
-from lagros_envs.registry import task_named
+from lagros_envs.registry import task_named, with_settings
 from lagros_envs.task import LARGEST_CONTROL, Numbers, Scenario, Task
 
 Channels = Literal["all", "rates"] | Sequence[bool]
@@ -61,7 +60,7 @@ class OfTask:
         found = task_named(task) if isinstance(task, str) else task
         check_instance("task", found, Task)
         self.usual = cast(Task, found)
-        return settings_of(self.usual, settings)
+        return with_settings(self.usual, settings)
 
     def _usual_steps(self) -> int:
         return self.usual.steps

@@ -5,14 +5,16 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from shlex import quote
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 
 from lagros_envs.checks import shown, suggestion
+from lagros_envs.conventions import settings_of
 from lagros_envs.task import Described, Task
 from lagros_envs.tasks import SHIPPED, Shipped
 
@@ -66,6 +68,39 @@ def called(task: Described) -> str:
     if own and file is not None and os.path.isfile(file):
         module = file
     return quote(f"{module}:{type(task).__qualname__}")
+
+
+def in_preset(task: Described, preset: str) -> Described:
+    """Return a task of one body in one of its presets: of other sizes, hence a task of its own.
+
+    The first preset is the task itself, and P the one that is registered as NAME-P.
+
+    Raises:
+        ValueError: It has no such preset.
+    """
+    if not isinstance(preset, str) or preset not in task.presets:
+        raise ValueError(
+            f"unknown preset {shown(preset)} of {task.name}.{suggestion(preset, task.presets)} "
+            f"Valid: {', '.join(task.presets)}."
+        )
+    return task if preset == task.presets[0] else task_named(f"{task.name}-{preset}")
+
+
+def with_settings(task: Task, settings: Task | Mapping[str, Any] | None) -> Task:
+    """Return a task with settings of its own.
+
+    Args:
+        task: With its default settings.
+        settings: The task itself; a dictionary of fields that differ from the defaults, and of
+            `preset` where the task has several; or None for the defaults.
+
+    Raises:
+        ValueError: It is neither, has an unknown entry, or a value that cannot be.
+    """
+    if isinstance(settings, Mapping) and task.presets and "preset" in settings:
+        rest = dict(settings)
+        return settings_of(cast(Task, in_preset(task, rest.pop("preset"))), rest)
+    return settings_of(task, settings)
 
 
 def find_task(text: str | Described) -> Described:

@@ -133,7 +133,8 @@ class Described:
         room: Its folder under `tasks/` of the packages above; None where it needs none.
         defaults: Of the commands.
         most_agents: Agents that a world may have; 1 for a task of one body.
-        presets: Kinds of worlds; () for a task of one body.
+        presets: Kinds of worlds; of one body, forms of other sizes, this one first and each other
+            registered as NAME-PRESET (`registry.in_preset`); () for none.
     """
 
     name: str

@@ -24,8 +24,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from lagros_envs.conventions import settings_of
-from lagros_envs.registry import called, task_named, task_names
+from lagros_envs.registry import called, task_named, task_names, with_settings
 from lagros_envs.task import Described, Task
 from lagros_envs.tasks import SHIPPED
 
@@ -68,8 +67,7 @@ def task_of(settings: Task | Mapping[str, Any] | None) -> Task:
     if isinstance(settings, Task):
         return settings
     usual: Any = task_named(task_names()[0])
-    found: Task = settings_of(usual, settings)
-    return found
+    return with_settings(usual, settings)
 
 
 def run_folder(task: Described) -> Path:

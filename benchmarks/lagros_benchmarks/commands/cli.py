@@ -30,6 +30,7 @@ from lagros_benchmarks.commands.terminal import (
     progress_bar,
     progress_line,
     refuse_options,
+    task_in_preset,
 )
 from lagros_benchmarks.commands.train import train
 from lagros_benchmarks.commands.watch import watch
@@ -109,7 +110,9 @@ def bench(
         str | None,
         typer.Option(metavar="N[,N]", help="Agents in a world, {agents}; several compare them."),
     ] = None,
-    preset: Annotated[str | None, typer.Option(help="Kind of worlds of agents: {presets}.")] = None,
+    preset: Annotated[
+        str | None, typer.Option(help="Kind of worlds of agents, or form of a body; {presets}.")
+    ] = None,
     safety_filter: Annotated[
         str | None,
         typer.Option(help="Of agents: none, all (policies use it) or both; {safety_filter}."),
@@ -192,6 +195,7 @@ def bench(
     named = None if policies is None else listed_names(policies)
     find_users_modules((task, *(named or ())))
     try:
+        task, preset = task_in_preset(task, preset)
         described: Any = find_any(task)
         if named is not None and "" in named:
             raise ValueError("--policies: an entry is empty; write them as a,b")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs
-from lagros_benchmarks.commands.terminal import fail, file_option
+from lagros_benchmarks.commands.terminal import fail, file_option, task_in_preset
 
 if TYPE_CHECKING:
     from lagros_policies.export.c99 import Tanh
@@ -45,7 +45,10 @@ def export(
     ] = None,
     preset: Annotated[
         str | None,
-        typer.Option(help="Of many agents: the radii of their bodies; paper if not given."),
+        typer.Option(
+            help="Of many agents: the radii of their bodies; of one body, its form. The "
+            "first of `lagros bench` if not given."
+        ),
     ] = None,
     agents: Annotated[
         int | None,
@@ -65,9 +68,11 @@ def export(
         fail(f"--tanh: {shown(tanh)} must be one of {', '.join(TANHS)}")
     if format_ == "onnx" and tanh is not None:
         fail("--tanh is for --format c; leave it out for onnx")
-    told = {"preset": preset, "num_agents": agents}
-    given = {name: value for name, value in told.items() if value is not None}
     try:
+        if task is not None:
+            task, preset = task_in_preset(task, preset)
+        told = {"preset": preset, "num_agents": agents}
+        given = {name: value for name, value in told.items() if value is not None}
         full = policy if task is None else f"{policy}-{task}"
         found = parted(full)[1]
         if given and isinstance(found, Task):

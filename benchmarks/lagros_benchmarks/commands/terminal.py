@@ -238,6 +238,22 @@ def find_users_modules(policies: Iterable[str]) -> None:
         sys.path.append(here)
 
 
+def task_in_preset(task: str, preset: str | None) -> tuple[str, str | None]:
+    """Return the task that is meant, and what is left of a preset: that of worlds of agents.
+
+    Raises:
+        ValueError: There is no such task, or one body has no such preset.
+    """
+    from lagros_envs.registry import called, find_any, in_preset
+
+    if preset is None:
+        return task, None
+    found = find_any(task)
+    if found.most_agents > 1 or not found.presets:
+        return task, preset
+    return called(in_preset(found, preset)), None
+
+
 def listed(
     text: str | Sequence[str], convert: Callable[[str], Value], option: str
 ) -> tuple[Value, ...]:

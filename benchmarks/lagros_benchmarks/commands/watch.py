@@ -14,6 +14,7 @@ from lagros_benchmarks.commands.terminal import (
     file_option,
     find_users_modules,
     refuse_options,
+    task_in_preset,
 )
 
 
@@ -29,7 +30,7 @@ def watch(
         int | None, typer.Option(help="Number of agents; the preset's own if not given.")
     ] = None,
     preset: Annotated[
-        str | None, typer.Option(help="Of paper, released, crossing, open, swarm. (default: paper)")
+        str | None, typer.Option(help="Kind of worlds of agents, or form of a body; {presets}.")
     ] = None,
     disturbance: Annotated[
         str, typer.Option(help="Of none, uniform, sphere, constant, sinusoid, gust, switching.")
@@ -67,6 +68,7 @@ def watch(
     try:
         if disturbance == "none":
             refuse_options(["--bound"], "no disturbance has a bound")
+        task, preset = task_in_preset(task, preset)
         settings = WatchSettings(
             task=find_task(task).name,
             policy=policy,

@@ -47,6 +47,18 @@ class Arm:
         """Number of controls, 2."""
         return 2
 
+    def energy(self, state: Components, functions: Any) -> Any:
+        """Return the energy of both masses [J]."""
+        shoulder, elbow, first, second = state
+        upper = self.first_length * first
+        lower = self.second_length * (first + second)
+        both = self.first_mass + self.second_mass
+        moving = 0.5 * (both * upper * upper + self.second_mass * lower * lower)
+        moving = moving + self.second_mass * upper * lower * functions.cos(elbow)
+        height = both * self.first_length * functions.sin(shoulder)
+        height = height + self.second_mass * self.second_length * functions.sin(shoulder + elbow)
+        return moving + self.gravity * height
+
     def derivative(self, state: Components, control: Components, functions: Any) -> Components:
         """Return dx/dt.
 

@@ -34,7 +34,7 @@ class ArmSettings(Task):
     """Swing from beside upright to another pose in 2 s, and hold it against gravity.
 
     Starts and limits of rates are those of C3M (Sun, Jha & Fan 2021), whose own task is to come
-    back to upright. A success is a tip within 0.2 m of where the goal has it.
+    back to upright. A success is a tip within 0.15 m of where the goal has it.
 
     Attributes:
         system: The arm.
@@ -54,7 +54,7 @@ class ArmSettings(Task):
     state_high = (math.pi, _UPRIGHT, _RATE, _RATE)
     control_low, control_high, control_scale = (-100.0, -50.0), (100.0, 50.0), (100.0, 50.0)
     control_spread = (10.0, 10.0)
-    goal_radius = 0.2
+    goal_radius = 0.15
     metric = MetricDesign(
         low=(_UPRIGHT - 0.7, -1.2, -1.1, -1.1),
         high=(_UPRIGHT + 0.7, 1.2, 1.1, 1.1),

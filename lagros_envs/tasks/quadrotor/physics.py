@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from lagros_envs.checks import check_constants
 from lagros_envs.dynamics.system import Components
@@ -27,6 +27,8 @@ class Quadrotor:
 
     gravity: float = 9.81
 
+    mirror: ClassVar[tuple[tuple[int, ...], ...]] = (-1, 1, 1, -1, 1, 1, 1, 1, -1), (1, 1, -1)
+
     def __post_init__(self) -> None:
         check_constants(self)
 
@@ -39,6 +41,14 @@ class Quadrotor:
     def control_dim(self) -> int:
         """Number of controls, 3."""
         return 3
+
+    def energy(self, state: Components, functions: Any) -> Any:
+        """Return the energy of a unit of mass in gravity and in a thrust that stays [J/kg]."""
+        place, velocity, (thrust, roll, pitch) = state[:3], state[3:6], state[6:9]
+        moving = sum(speed * speed for speed in velocity)
+        axis = self._axis(roll, pitch, functions)
+        along = sum(one * other for one, other in zip(axis, place, strict=True))
+        return 0.5 * moving + self.gravity * (place[2] - thrust * along)
 
     def derivative(self, state: Components, control: Components, functions: Any) -> Components:
         """Return dx/dt.
@@ -54,14 +64,14 @@ class Quadrotor:
         """
         velocity, (thrust, roll, pitch) = state[3:6], state[6:9]
         push = self.gravity * thrust
-        ahead = push * functions.cos(pitch)
-        return (
-            *velocity,
-            push * functions.sin(pitch),
-            -ahead * functions.sin(roll),
-            ahead * functions.cos(roll) - self.gravity,
-            *control[:3],
-        )
+        x, y, z = self._axis(roll, pitch, functions)
+        return (*velocity, push * x, push * y, push * z - self.gravity, *control[:3])
+
+    @staticmethod
+    def _axis(roll: Any, pitch: Any, functions: Any) -> Components:
+        """Return the axis of the rotors, a unit vector."""
+        level = functions.cos(pitch)
+        return functions.sin(pitch), -level * functions.sin(roll), level * functions.cos(roll)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +80,8 @@ class HeadingQuadrotor(Quadrotor):
 
     State x = [p, v, tau, phi, theta, psi], control u = d/dt [tau, phi, theta, psi].
     """
+
+    mirror = (*Quadrotor.mirror[0], -1), (*Quadrotor.mirror[1], -1)
 
     @property
     def state_dim(self) -> int:

@@ -62,9 +62,23 @@ class QuadrotorSettings(Task):
         *("p_x [m]", "p_y [m]", "p_z [m]", "v_x [m/s]", "v_y [m/s]", "v_z [m/s]"),
         *("tau [-]", "phi [rad]", "theta [rad]"),
     )
-    control_names: ClassVar[tuple[str, ...]] = ("dtau/dt [1/s]", "dphi/dt [rad/s]", "dtheta/dt [rad/s]")
+    control_names: ClassVar[tuple[str, ...]] = (
+        "dtau/dt [1/s]",
+        "dphi/dt [rad/s]",
+        "dtheta/dt [rad/s]",
+    )
     rates = (3, 5, 4)
-    state_low: ClassVar[Numbers] = (-_FAR, -_FAR, -_FAR, -_SPEED, -_SPEED, -_SPEED, 0.5, -_TILT, -_TILT)
+    state_low: ClassVar[Numbers] = (
+        -_FAR,
+        -_FAR,
+        -_FAR,
+        -_SPEED,
+        -_SPEED,
+        -_SPEED,
+        0.5,
+        -_TILT,
+        -_TILT,
+    )
     state_high: ClassVar[Numbers] = (_FAR, _FAR, _FAR, _SPEED, _SPEED, _SPEED, 2.0, _TILT, _TILT)
     state_scale: ClassVar[Numbers] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.1, 0.1, 0.1)
     control_low: ClassVar[Numbers] = (-5.0, -5.0, -5.0)
