@@ -185,9 +185,9 @@ class PlaneRenderer(Canvas):
         if around < 4 * WIDTH * OVERSAMPLING:
             circle(self._canvas, SKY_BLUE, goal, around, 2 * OVERSAMPLING)
         for sign in (1, -1):
-            arm = 6 * OVERSAMPLING
-            first = (goal[0] - arm, goal[1] - sign * arm)
-            self._line(first, (goal[0] + arm, goal[1] + sign * arm), GREEN, 2.5)
+            half = 6 * OVERSAMPLING
+            first = (goal[0] - half, goal[1] - sign * half)
+            self._line(first, (goal[0] + half, goal[1] + sign * half), GREEN, 2.5)
         trail = [self._point(self._place(one.state)) for one in self._history]
         for start, end in itertools.pairwise(trail):
             self._line(start, end, mix(BLUE, 0.5), 2)
