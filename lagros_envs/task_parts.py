@@ -83,6 +83,9 @@ class Learning:
         round_plans: Episodes of each round.
         round_samples: Labelled states of each round.
         round_epochs: Passes over the data before each round.
+        keeps_plan: Whether (c) learns to follow the plan from the start, as (b) does: its network
+            sees where the episode began, and rounds fly the episodes of the first data and label
+            what they meet around the plans of these. Else rounds plan anew from what they meet.
         scheduled: Whether (c) is affine in the state, u = c + K x with c and K made of the episode
             and the time: the form of the law itself. It needs features that are affine in it.
         slope_weight: Of the error of the slope of (c), du/dx against K, in the loss.
@@ -103,6 +106,7 @@ class Learning:
     round_plans: int = 1000
     round_samples: int = 50_000
     round_epochs: int = 20
+    keeps_plan: bool = False
     scheduled: bool = False
     slope_weight: float = 0.0
     mpc_samples: int | None = None

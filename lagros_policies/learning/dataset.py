@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.balls import into_unit_ball
 from lagros_envs.checks import (
     check_disturbance_bound,
     check_fields,
@@ -25,16 +24,16 @@ from lagros_envs.checks import (
     check_seed,
     check_whole,
 )
-from lagros_envs.dynamics import hold_step
 from lagros_envs.seeding import episode_seeds, episode_streams
 from lagros_envs.task import Scenario, Task
 from lagros_policies.backends import LOKY, Backend
 from lagros_policies.contraction import Metric
 from lagros_policies.contraction.metric_files import region_record
-from lagros_policies.expert import Expert, TrackedPlans
+from lagros_policies.expert import Expert
 from lagros_policies.learning.networks import Mlp
-from lagros_policies.learning.rounds import draw_pushes, fallen, met_states, padded_discs
+from lagros_policies.learning.rounds import draw_pushes, met_along, met_states, padded_discs
 from lagros_policies.learning.shards import Shard, make_shards
+from lagros_policies.learning.tubes import around, tube_states
 from lagros_policies.planning import PlannerSettings, Trajectory
 from lagros_policies.room import task_of
 
@@ -115,6 +114,11 @@ class ExpertData:
     plan_discs: FloatArray
     drawn: int
 
+    @property
+    def plans(self) -> Shard:
+        """All that is said of the plans."""
+        return {name: value for name, value in vars(self).items() if name.startswith("plan_")}
+
     def nominal_pairs(self, task: Task) -> tuple[FloatArray, FloatArray, IntArray]:
         """Return the observations along the plans, u_d there, and which plan: data of (a)."""
         plan, step = np.nonzero(np.arange(task.steps) >= self.plan_steps[:, None])
@@ -174,6 +178,7 @@ def generate(
     on_shard: Callable[[int], None] | None = None,
     backend: Backend = LOKY,
     network: Mlp | None = None,
+    along: ExpertData | None = None,
 ) -> ExpertData:
     """Generate expert data, or finish what an interrupted call began.
 
@@ -187,6 +192,8 @@ def generate(
         backend: Whose processes they are.
         network: Plan from where it comes to in the episodes, as DAgger does, and not from their
             starts.
+        along: Let it fly the episodes of these data instead, and label what it meets around their
+            plans.
 
     Returns:
         All samples, in an order that does not depend on the processes.
@@ -195,8 +202,13 @@ def generate(
         ValueError: The folder holds data of other settings, or a shard is damaged.
     """
     task = task_of(task)
-    make = partial(make_shard, metric=metric, settings=settings, task=task, network=network)
+    plans = None if along is None else along.plans
+    make = partial(
+        make_shard, metric=metric, settings=settings, task=task, network=network, along=plans
+    )
     record = record_of(metric, settings, task, network)
+    if along is not None:
+        record["along"] = len(along.plan_states)
     return _join(make_shards(folder, settings.shards, make, record, jobs, on_shard, backend))
 
 
@@ -206,11 +218,18 @@ def make_shard(
     settings: ExpertDataSettings,
     task: Task,
     network: Mlp | None = None,
+    along: Shard | None = None,
 ) -> Shard:
     """Generate one shard: plan, fill the tubes, keep the verified region, label."""
     expert = Expert(task, metric)
-    episodes = episodes_of(index, settings, task)
     rng = np.random.default_rng([settings.seed, index])
+    if along is not None:
+        # The plans keep their order, so that those held out stay so.
+        parts = {name: np.array_split(plans, settings.shards) for name, plans in along.items()}
+        return _labelled(
+            rng, expert, settings, {name: parts[name][index] for name in parts}, network
+        )
+    episodes = episodes_of(index, settings, task)
     if network is None:
         held = planned_episodes(expert, episodes)
     else:
@@ -224,7 +243,18 @@ def make_shard(
         held = [(episode, step, plan) for episode, step, plan in plans if plan is not None]
     if not held:
         raise ValueError(f"none of the {len(episodes)} episodes of shard {index} has a plan")
-    shard = plan_arrays(task, held)
+    return _labelled(rng, expert, settings, plan_arrays(task, held))
+
+
+def _labelled(
+    rng: np.random.Generator,
+    expert: Expert,
+    settings: ExpertDataSettings,
+    shard: Shard,
+    network: Mlp | None = None,
+) -> Shard:
+    """Label states around plans: in their tubes, or where a network comes to."""
+    task, metric = expert.task, expert.metric
     states, controls, first = (shard[f"plan_{name}"] for name in ("states", "controls", "steps"))
     tracked = expert.track(states, controls)
     wanted = settings.samples // settings.shards
@@ -239,7 +269,11 @@ def make_shard(
                 f"only {kept} of {drawn} states lie in the verified region {metric.region}: "
                 "verify a larger region or lower disturbance_bound"
             )
-        points, plan_of, step = tube_states(rng, expert, tracked, settings, first)
+        if network is None:
+            points, plan_of, step = tube_states(rng, expert, tracked, settings, first)
+        else:
+            met = met_along(rng, task, network, shard, settings.disturbance_bound)
+            points, plan_of, step = around(rng, task, met, settings, first)
         choice = rng.permutation(len(points))
         points, plan_of, step = points[choice], plan_of[choice], step[choice]
         nominal, nominal_control = states[plan_of, step], controls[plan_of, step]
@@ -300,54 +334,6 @@ def plan_arrays(task: Task, held: Sequence[Planned]) -> Shard:
 def _from_first(rows: FloatArray, count: int) -> FloatArray:
     """Return so many rows, the first one repeated before the others."""
     return np.concatenate([np.repeat(rows[:1], count - len(rows), axis=0), rows])
-
-
-def tube_states(
-    rng: np.random.Generator,
-    expert: Expert,
-    tracked: TrackedPlans,
-    settings: ExpertDataSettings,
-    first: IntArray | None = None,
-) -> tuple[FloatArray, IntArray, IntArray]:
-    """Fill the tube around each plan: u* in closed loop under random disturbances (Theorem 4).
-
-    Each plan is flown once, to a fall, under a kind and a bound of its own; a ball the size of one
-    more step of disturbance surrounds every state that is met.
-
-    Args:
-        rng: Random generator.
-        expert: The law u*.
-        tracked: The plans.
-        settings: What to generate.
-        first: Step at which each plan begins, shape (p,); all at the first if left out.
-
-    Returns:
-        States (s, n), the plan and the step of each.
-    """
-    states = tracked.states
-    plans, steps = tracked.controls.shape[:2]
-    every = np.arange(plans)
-    first = np.zeros(plans, int) if first is None else first
-    task, period = expert.task, expert.task.control_period
-    pushes = draw_pushes(rng, plans, task, settings.disturbance_bound)
-    state = states[:, 0]
-    met = np.full((plans, steps, states.shape[-1]), np.nan)
-    down = np.zeros(plans, bool)
-    for step in range(steps):
-        met[~down, step] = state[~down]
-        control = expert.control(tracked, every, np.full(plans, step), state)
-        following = hold_step(task.system, state, control, period, pushes[:, step])
-        down |= fallen(task, following)
-        state = np.where((~down & (first <= step))[:, None], following, state)
-    spread = settings.spread * settings.disturbance_bound * period
-    noise = into_unit_ball(rng.standard_normal(met.shape)) * rng.random((plans, steps, 1))
-    # The start is known exactly; the tube has radius zero there.
-    noise[every, first] = 0.0
-    met += spread * noise
-    under_way = np.arange(steps) >= first[:, None]
-    finite = np.all(np.isfinite(met), axis=-1) & under_way
-    plan_of, step_of = np.nonzero(finite)
-    return met[finite], plan_of, step_of
 
 
 def _join(shards: list[Shard]) -> ExpertData:

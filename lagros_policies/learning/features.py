@@ -52,6 +52,7 @@ _MOTION = (
     "motion ahead [m/s]",
     "motion aside [m/s]",
 )
+_BEGUN = ("ahead", "aside", "side")
 _DISC = (
     "x [m]",
     "y [m]",
@@ -181,7 +182,8 @@ class Usual:
     Of the body: where the goal is, the other coordinates of state and goal, sine and cosine of
     angles, how the position moves when the control rests, and the time that is left. Of a disc:
     where it is, in the axes of the world, of the way to the goal and of the motion, and how far its
-    edge is from the body's; zeros where there is none.
+    edge is from the body's; zeros where there is none. With `Learning.keeps_plan` also where the
+    episode began, on which its plan depends, and where each disc is from there.
 
     Args:
         task: The task; a coordinate whose unit is "[rad]" is an angle.
@@ -197,7 +199,9 @@ class Usual:
         """Look at the coordinates."""
         n = task.system.state_dim
         self.task, self._discs = task, task.most_discs if task.position else 0
-        self.alike = Alike(self._discs, len(_DISC)) if self._discs else None
+        self._begun = task.learning is not None and task.learning.keeps_plan
+        of_disc = (*(f"{part} of the start" for part in _BEGUN), *_DISC) if self._begun else _DISC
+        self.alike = Alike(self._discs, len(of_disc)) if self._discs else None
         names = task.state_names or tuple(f"x{index}" for index in range(n))
         self._plane = len(task.position) == 2
         self._placed = task.position or tuple(range(n))
@@ -211,7 +215,8 @@ class Usual:
             *(f"{part} {names[index]}" for index in self._angles for part in ("sin", "cos")),
             "time left [s]",
             *(_MOTION if self._plane else ()),
-            *(f"{part} of disc {disc}" for disc in range(self._discs) for part in _DISC),
+            *(self._names_of_start(names) if self._begun else ()),
+            *(f"{part} of disc {disc}" for disc in range(self._discs) for part in of_disc),
         )
 
     def __call__(self, observation: Sequence[Any], functions: Any) -> Seen:
@@ -229,12 +234,35 @@ class Usual:
             way, motion = features[:2], [rates[index] for index in task.position]
             (ahead, distance), (course, speed) = (_unit(one, functions) for one in (way, motion))
             features += [distance, *ahead, *motion, speed, *_turned(motion, ahead)]
-            here = [state[index] for index in task.position]
-            discs = observation[layout.discs]
+        start = observation[layout.initial_state]
+        if self._begun:
+            features += [start[index] - state[index] for index in self._placed]
+            features += [start[index] for index in self._others]
+            features += [goal[index] - start[index] for index in self._placed]
+        if self._discs:
+            here, discs = [state[index] for index in task.position], observation[layout.discs]
+            if self._begun:
+                begun = [start[index] for index in task.position]
+                route, _ = _unit([goal[index] - start[index] for index in task.position], functions)
             for place in range(0, 3 * self._discs, 3):
                 disc = discs[place : place + 3]
+                if self._begun:
+                    features += self._from_start(disc, begun, route, functions)
                 features += self._disc(disc, here, ahead, course, functions)
         return Seen(features)
+
+    def _names_of_start(self, names: Sequence[str]) -> tuple[str, ...]:
+        return (
+            *(f"{names[index]} of the start from here" for index in self._placed),
+            *(f"{names[index]} of the start" for index in self._others),
+            *(f"{names[index]} of the goal from the start" for index in self._placed),
+        )
+
+    def _from_start(self, disc: Vector, begun: Vector, route: Vector, functions: Any) -> list[Any]:
+        """Return where a disc is along the way from start to goal, and how much in it."""
+        ahead, aside = _turned((disc[0] - begun[0], disc[1] - begun[1]), route)
+        seen = ahead, aside, functions.exp(-aside * aside)
+        return [functions.where(disc[2] > 0.0, one, 0.0) for one in seen]
 
     def _disc(
         self, disc: Vector, here: Vector, ahead: Vector, course: Vector, functions: Any

@@ -29,11 +29,11 @@ from lagros_policies.learning.dataset import (
     plan_arrays,
     planned_episodes,
     record_of,
-    tube_states,
 )
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.learning.rounds import LATEST, draw_pushes, fallen, flown, trouble
 from lagros_policies.learning.shards import Shard, make_shards
+from lagros_policies.learning.tubes import tube_states
 from lagros_policies.planning import Trajectory
 from lagros_policies.planning.planner import Planner
 from lagros_policies.room import task_of

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +83,32 @@ def met_states(
         (int(which), int(max(step[which], 0)), states[which, max(step[which], 0)])
         for which in np.flatnonzero(picked)
     ]
+
+
+def met_along(
+    rng: np.random.Generator,
+    task: Task,
+    network: Mlp,
+    plans: Mapping[str, NDArray[Any]],
+    bound: float,
+) -> FloatArray:
+    """Let a network fly the episodes of plans, each under a kind and a bound of its own.
+
+    Args:
+        rng: Random generator.
+        task: The task.
+        network: The network.
+        plans: `plan_starts`, `plan_states` and `plan_discs`, as in `ExpertData`.
+        bound: Largest bound of the disturbance.
+
+    Returns:
+        The states at each control step, shape (p, N, n).
+    """
+    goals = plans["plan_states"][:, -1]
+    discs = [rows[rows[:, 2] > 0.0] for rows in plans["plan_discs"]]
+    episodes = [Scenario(*one) for one in zip(plans["plan_starts"], goals, discs, strict=True)]
+    pushes = draw_pushes(rng, len(episodes), task, bound)
+    return flown(task, network, episodes, pushes)[:, :-1]
 
 
 def flown(task: Task, network: Mlp, episodes: Sequence[Scenario], pushes: FloatArray) -> FloatArray:

@@ -11,7 +11,8 @@ from lagros_envs.tasks.cartpole.physics import CartPole
 from lagros_envs.tasks.pvtol.physics import Pvtol
 from lagros_policies.contraction.feedback import riccati_gains
 from lagros_policies.expert import Expert
-from lagros_policies.learning.dataset import ExpertDataSettings, tube_states
+from lagros_policies.learning.dataset import ExpertDataSettings
+from lagros_policies.learning.tubes import tube_states
 from lagros_policies.proof import hold_error, remainder
 from lagros_policies.proof.error_set import ErrorSet, boxed
 from lagros_policies.proof.hold_error import HoldOfErrors

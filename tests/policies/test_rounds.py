@@ -9,6 +9,7 @@ import pytest
 from lagros_envs import register_task
 from lagros_envs.numbers import Dual, functions
 from lagros_envs.registry import find_task
+from lagros_envs.task import Learning, Scenario
 from lagros_envs.tasks.pvtol.task import PvtolSettings
 from lagros_policies.learning.dataset import ExpertDataSettings, generate
 from lagros_policies.learning.features import moved, seen, view_of
@@ -56,12 +57,20 @@ def observed(task, rng, count=30):
     for row, episode in zip(rows, episodes_of(task, count), strict=True):
         row[task.layout.state] = episode.initial_state + rng.normal(size=task.system.state_dim)
         row[task.layout.goal] = episode.goal
+        row[task.layout.initial_state] = episode.initial_state
         row[task.layout.time] = rng.uniform(0.0, task.time_limit)
         row[task.layout.discs][: episode.discs.size] = episode.discs.ravel()
     return rows
 
 
-@pytest.mark.parametrize("task", [PvtolSettings(), Slide(), Drive()], ids=lambda task: task.name)
+@dataclass(frozen=True)
+class Keeping(Slide):
+    learning = Learning(keeps_plan=True)
+
+
+@pytest.mark.parametrize(
+    "task", [PvtolSettings(), Slide(), Drive(), Keeping()], ids=lambda task: type(task).__name__
+)
 def test_features_are_what_their_names_say(task):
     view, rows = view_of(task), observed(task, np.random.default_rng(1))
     features, signs = seen(view, rows)
@@ -85,6 +94,12 @@ def test_features_are_what_their_names_say(task):
             if name.endswith(f" of disc {disc}")
         }
         assert all(not np.any(values[~there]) for values in column.values())
+        if "ahead of the start" in column:
+            begun = rows[:, task.layout.initial_state][:, :2]
+            route, from_start = goal[:, :2] - begun, discs[:, disc, :2] - begun
+            length = np.linalg.norm(route, axis=1)
+            aside = (route[:, 0] * from_start[:, 1] - route[:, 1] * from_start[:, 0]) / length
+            np.testing.assert_allclose(column["aside of the start"][there], aside[there], atol=1e-4)
         gap = np.linalg.norm(apart, axis=1) - radius - task.body_radius
         np.testing.assert_allclose(column["gap [m]"][there], gap[there], atol=1e-5)
         ahead = np.sum(apart * way, axis=1) / distance
@@ -223,6 +238,51 @@ def test_a_round_gives_data_around_plans_that_begin_under_way(tmp_path):
     # Another network is another round.
     with pytest.raises(ValueError, match="round holds expert data of other settings"):
         generate(tmp_path / "round", metric, settings, task, network=a_network(task))
+
+
+def test_a_network_that_is_to_keep_plans_sees_which_plan_it_is_on():
+    """What it sees of an episode tells its plan apart, wherever the body is."""
+    task = Keeping()
+    view, episodes = view_of(task), observed(task, np.random.default_rng(2), 20)
+    rows = np.repeat(episodes[:1], 20, axis=0)
+    rows[:, task.layout.initial_state] = episodes[:, task.layout.initial_state]
+    assert len(np.unique(seen(view, rows)[0], axis=0)) == 20
+    assert len(np.unique(seen(view_of(Slide()), rows)[0], axis=0)) == 1
+    names = dict(zip(view.names, seen(view, rows)[0].T, strict=True))
+    begun = rows[:, task.layout.initial_state]
+    np.testing.assert_allclose(
+        names["x1 of the start from here"], begun[:, 1] - rows[:, 1], atol=1e-6
+    )
+    assert view.names[-1].startswith("presence")
+    assert len(view.names) == len(view_of(Slide()).names) + 6 + 3 * task.most_discs
+
+
+def test_a_round_along_plans_labels_where_the_network_comes_to_around_the_first_plans(tmp_path):
+    task = Slide()
+    metric = MetricSettings(pool=400, checks=100).design(task)
+    settings = ExpertDataSettings(plans=8, samples=200, shards=2, disturbance_bound=1e-9)
+    base = generate(tmp_path / "data", metric, settings, task)
+    network = a_network(task, size=1.0)
+    data = generate(tmp_path / "round", metric, settings, task, network=network, along=base)
+    for name, plans in base.plans.items():
+        np.testing.assert_array_equal(data.plans[name], plans)
+    # As good as undisturbed: every state is one of the flights of the network.
+    episodes = [
+        Scenario(start, plan[-1], discs[discs[:, 2] > 0.0])
+        for start, plan, discs in zip(
+            base.plan_starts, base.plan_states, base.plan_discs, strict=True
+        )
+    ]
+    still = np.zeros((len(episodes), task.steps, 4))
+    paths = flown(task, network, episodes, still)
+    steps = np.rint(data.observation[:, task.layout.time] / task.control_period).astype(int)
+    states = data.observation[:, task.layout.state]
+    np.testing.assert_allclose(states, paths[data.plan, steps], atol=1e-6)
+    # Among them states far from the plan, but none outside the region.
+    error = states - base.plan_states[data.plan, steps]
+    assert 0.2 < np.abs(error).max() <= max(task.metric.error)
+    law = base.plan_controls[data.plan, steps] + np.einsum("smi,si->sm", data.gain, error)
+    np.testing.assert_allclose(data.control, np.clip(law, -4.0, 4.0), atol=1e-9)
 
 
 def test_a_task_without_a_metric_is_told_so():

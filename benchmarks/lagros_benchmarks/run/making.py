@@ -49,6 +49,8 @@ class Making:
         self.settings, self.task, self.folder = settings, settings.description, folder
         self.progress, self.say = progress, say
         self.see = view_of(self.task)
+        learning = self.task.learning
+        self._keeps_plan = learning is not None and learning.keeps_plan
 
     def run(self) -> None:
         """Make all stages."""
@@ -63,7 +65,8 @@ class Making:
             name = f"round{number}"
             network = self._network(f"before_{name}", settings.between, samples, after)
             after = self.folder / f"before_{name}_checkpoint.safetensors"
-            parts.append(self._data(name, f"round {number}", metric, data, network))
+            along = parts[0] if self._keeps_plan else None
+            parts.append(self._data(name, f"round {number}", metric, data, network, along))
             samples.append(self._labelled(parts[-1], number))
         # (c) imitates u* in the tube, (a) imitates u_d on the plans.
         self._final("lagros", settings.lagros, samples, after)
@@ -136,6 +139,7 @@ class Making:
         metric: Metric,
         settings: ExpertDataSettings,
         network: Mlp | None = None,
+        along: ExpertData | None = None,
     ) -> ExpertData:
         begun = perf_counter()
         data = generate(
@@ -147,6 +151,7 @@ class Making:
             lambda done: self.progress(title, done, settings.shards),
             self.settings.backend,
             network,
+            along,
         )
         self.say(
             f"{title} ({perf_counter() - begun:.0f} s): {len(data.observation)} samples around "
