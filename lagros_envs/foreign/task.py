@@ -77,12 +77,12 @@ class Foreign(Described):
     room = "foreign"
 
     def __post_init__(self) -> None:
-        own = [item for item in fields(self)[1:] if item.name != "label"]
         given = [
             item.name
-            for item in own
-            if getattr(self, item.name) is not item.default and getattr(self, item.name) != {}
+            for item in fields(self)[1:]
+            if item.name not in ("label", "kwargs") and getattr(self, item.name) is not item.default
         ]
+        given += ["kwargs"] if self.kwargs else []
         if not self.label and (given or not isinstance(self.env, str)):
             raise ValueError(
                 "label='' must be a name for tables: "
@@ -128,7 +128,7 @@ class Foreign(Described):
                 )
         try:
             env.reset(seed=0)
-            if self.channels == "all" and env.pushes.knows_rates:
+            if env.pushes.knows_rates and isinstance(self.channels, str):
                 # Whether all can be pushed is said where all are asked for.
                 env = self.disturbed(env.env, "constant", self.bound, "rates")
                 env.reset(seed=0)

@@ -6,6 +6,8 @@ import copy
 import pickle
 import warnings
 from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +19,7 @@ from pettingzoo.test import parallel_api_test
 from lagros_envs import disturb
 from lagros_envs.disturbances import OPEN_LOOP
 from lagros_envs.foreign import adapters
+from tests import documents
 from tests.envs.foreign_worlds import STEP, Drift, Joints, OfDrift, OfPair, Pair, particles
 
 KINDS = [kind for kind in OPEN_LOOP if kind != "none"]
@@ -292,6 +295,63 @@ def test_the_adapter_of_particle_worlds():
     several = particles(lambda row: torch.tensor([row, row]), pos=[1.0], rot=[], vel=[], ang_vel=[])
     with pytest.raises(ValueError, match="num_envs=1"):
         adapters.adapter_for(several).state(several)
+
+
+def test_environments_of_mujoco_where_it_is_installed():
+    pytest.importorskip("mujoco")
+    for kind, bound in (("uniform", 0.5), ("uniform", 0.0)):
+        env = disturb(gym.make("Hopper-v5"), kind, bound=bound, channels="rates")
+        bare = gym.make("Hopper-v5")
+        actions = actions_of(env, 1)
+        seen, _, pushes = flown(env, actions=actions)
+        alone = [bare.reset(seed=3)[0], *(bare.step(action)[0] for action in actions)]
+        assert np.array_equal(seen, alone) == (bound == 0.0)
+        assert not pushes[:, :6].any()
+        assert np.linalg.norm(pushes, axis=-1).max() <= bound
+    with pytest.raises(ValueError, match="quaternions"):
+        flown(disturb(gym.make("Ant-v5"), bound=0.5))
+    flown(disturb(gym.make("Ant-v5"), bound=0.5, channels="rates"))
+
+
+def test_worlds_of_mpe_where_they_are_installed():
+    worlds = pytest.importorskip("mpe2.simple_spread_v3")
+    env = disturb(worlds.parallel_env(N=3, continuous_actions=True), "constant", bound=0.3)
+    parallel_api_test(env, num_cycles=10)
+    env.reset(seed=0)
+    pushes = env.step({agent: np.zeros(5, np.float32) for agent in env.agents})[4]
+    lengths = [np.linalg.norm(info["disturbance"]) for info in pushes.values()]
+    assert lengths == pytest.approx([0.3] * 3)
+
+
+def test_worlds_of_vmas_where_they_are_installed():
+    vmas = pytest.importorskip("vmas")
+    world = vmas.make_env(
+        "navigation", 1, device="cpu", wrapper="gymnasium", n_agents=2, terminated_truncated=True
+    )
+    env = disturb(world, "constant", bound=0.3, channels="rates", steps=20)
+    env.reset(seed=0)
+    push = env.step(env.action_space.sample())[4]["disturbance"]
+    assert not push[:, :3].any()
+    assert np.linalg.norm(push, axis=-1) == pytest.approx([0.3] * 2)
+
+
+def test_what_the_page_shows_runs(capsys):
+    page = Path(__file__).parents[2] / "docs" / "disturb.md"
+    wrapped, adapter, described = documents.python_blocks(page.read_text(encoding="utf-8"))
+    exec(wrapped, {})
+    assert np.fromstring(capsys.readouterr().out.strip("[]\n"), sep=" ").shape == (2,)
+    names = {}
+    exec(adapter, names)
+    exec(described, names)
+    env = Drift()
+    env.body = SimpleNamespace(position=[0.0, 1.0], velocity=[2.0, 3.0])
+    own = names["OfMine"]()
+    own.set_state(env, np.arange(4.0) + 1.0)
+    assert own.state(env) == [1.0, 2.0, 3.0, 4.0]
+    assert names["task"].facts.states == 2
+    pushed = flown(names["task"].make("sphere", 0.5))[2]
+    assert not pushed[:, 0].any()
+    assert np.allclose(np.abs(pushed[:, 1]), 2.5)
 
 
 class Deaf(OfDrift):

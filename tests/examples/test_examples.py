@@ -50,6 +50,7 @@ def test_every_example_is_tested_and_says_how_it_is_run():
     names = sorted(path.stem for path in EXAMPLES.glob("*.py") if path not in found.EXAMPLES)
     assert names == [
         "cleanrl_ppo_cartpole",
+        "disturbed_pendulum",
         "metric_in_cvxpy",
         "planner_in_cvxpy",
         "rllib_ppo_spacecraft",
@@ -142,6 +143,18 @@ def test_its_advantage_is_the_sum_of_discounted_surprises(example):
     np.testing.assert_allclose(
         advantage[:, 1], [1.5 + 0.25 * (1.0 + 0.25 * 2.5), 1.0 + 0.25 * 2.5, 2.5, 0.0]
     )
+
+
+@pytest.mark.slow
+def test_the_disturbed_pendulum(example):
+    pytest.importorskip("stable_baselines3", reason="the extra `rl` is not installed")
+    module = example("disturbed_pendulum")
+    calm, pushed = (module.train(bound, steps=4096, seed=0) for bound in (0.0, module.BOUND))
+    assert not np.array_equal(*(weights(model.policy) for model in (calm, pushed)))
+    env = module.pendulum(module.BOUND)
+    env.reset(seed=0)
+    push = env.step(env.action_space.sample())[4]["disturbance"]
+    assert np.linalg.norm(push) == pytest.approx(module.BOUND)
 
 
 @pytest.mark.slow
