@@ -76,6 +76,5 @@ class BallBeamTask(Task):
         return abs(state[0]) - 1.0
 
     def features(self, seen: Sequence[Any], functions: Any) -> Sequence[Any]:
-        """Return what networks see, first what is affine in the state; the beam is not mirrored."""
-        place, goal, start = seen[0], seen[4], seen[8]
-        return [place - goal, seen[1], seen[2], seen[3], goal, start, seen[self.layout.time]]
+        """Return what networks see: the state about the goal, goal, start, time."""
+        return [seen[0] - seen[4], *seen[1:4], seen[4], seen[8], seen[self.layout.time]]

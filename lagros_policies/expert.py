@@ -222,9 +222,18 @@ class Expert:
             _ = self.law  # a metric that is missing is said here, not in flight
 
     @property
-    def has_metric(self) -> bool:
-        """Whether `metric` is there, or is still to be made as the task describes it."""
-        return self._metric is not None or has_metric(self.task)
+    def known_metric(self) -> ContractionMetric | None:
+        """`metric`, or None where the task has none, or where it is still to be made.
+
+        Raises:
+            ValueError: It is damaged, or one of another system.
+        """
+        if self._metric is None and not has_metric(self.task):
+            return None
+        try:
+            return self.metric
+        except FileNotFoundError:
+            return None
 
     @cached_property
     def metric(self) -> ContractionMetric:

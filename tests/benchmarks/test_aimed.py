@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from lagros_benchmarks.worst_case.aimed import aimed_sequences, supports
-from lagros_benchmarks.worst_case.flights import draw_episodes, expert_of, fly, tracking_law
+from lagros_benchmarks.worst_case.flights import draw_episodes, fly, tracking_law
 from lagros_benchmarks.worst_case.goals import loop_slopes, profile
 from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_benchmarks.worst_case.single import SingleTarget
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_policies.expert import Expert
 
 
 def driven(by_state, by_push, pushes):
@@ -66,7 +67,7 @@ def test_the_sequence_of_the_norm_is_that_of_the_worst_of_all_directions(loops):
 
 def test_aimed_flights_reach_what_is_predicted_and_more_than_a_search_without_them():
     task = CartPoleSettings()
-    expert = expert_of(task)
+    expert = Expert(task)
     episodes = draw_episodes(expert, episode_seeds(1, 3, 12345))
     law, every = tracking_law(expert, episodes), np.arange(3)
     calm = np.zeros((3, task.steps, 4))

@@ -19,9 +19,8 @@ from lagros_envs import registry
 from lagros_envs.env import TaskEnv
 from lagros_envs.registry import find_task, task_named, task_names
 from lagros_envs.seeding import EVALUATION, episode_seeds, episode_streams
+from tests.found import SINGLE_BODY, named, task_of
 from tests.policies import toys
-
-SINGLE = [name for name in task_names() if task_named(name).most_agents == 1]
 
 
 @pytest.fixture
@@ -50,16 +49,18 @@ def test_the_parts_of_every_room_are_there():
         assert (room.scene is None) == (task_named(name).most_agents == 1)
 
 
-@pytest.mark.parametrize("task", SINGLE)
+@pytest.mark.parametrize("task", named(SINGLE_BODY))
 def test_bench_flies_every_task_of_one_body(task, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    described = task_of(task)
     command = ("bench", task, "--policies", "lqr,random", "--episodes", "2", "--seed", "7")
     result = invoke(*command, "--json", "a.json", "--figure", "a.png", "--episodes-file", "e")
     assert result.exit_code == 0, result.output
     assert max(len(line.rstrip()) for line in result.stdout.splitlines()) <= 80
     rows = json.loads(Path("a.json").read_text())
-    assert [(row["task"], row["policy"]) for row in rows] == [(task, "lqr"), (task, "random")]
-    assert {row["bound"] for row in rows} == set(task_named(task).defaults.bounds)
+    flown = [(described.name, policy) for policy in ("lqr", "random")]
+    assert [(row["task"], row["policy"]) for row in rows] == flown
+    assert {row["bound"] for row in rows} == set(described.defaults.bounds)
     episodes = [json.loads(line) for line in Path("e").read_text().splitlines()]
     for row in rows:
         own = [one for one in episodes if one["policy"] == row["policy"]]

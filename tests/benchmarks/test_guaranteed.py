@@ -21,7 +21,7 @@ from lagros_benchmarks.report.tables import csv_text, latex_text, markdown_text,
 from lagros_benchmarks.run.runner import kept_in, run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings
 from lagros_benchmarks.worst_case.aimed import supports
-from lagros_benchmarks.worst_case.flights import applied, draw_episodes, expert_of
+from lagros_benchmarks.worst_case.flights import applied, draw_episodes
 from lagros_benchmarks.worst_case.search import SearchSettings
 from lagros_envs.dynamics import linearise_hold
 from lagros_envs.registry import find_task
@@ -30,6 +30,7 @@ from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.pvtol.task import PvtolSettings
 from lagros_policies.contraction.certificate import Certificate, TubeSizes
 from lagros_policies.contraction.feedback import riccati_gains
+from lagros_policies.expert import Expert
 from lagros_policies.policy import make
 from lagros_policies.proof.plan_tube import plan_tubes
 
@@ -47,7 +48,7 @@ def linear_loop(task, weights, count=3, flown=1.0, shrunk=1.0):
         flown: The gain that flies, as a multiple of the one whose tubes are proved.
         shrunk: By what the tubes are multiplied.
     """
-    episodes = draw_episodes(expert_of(task), episode_seeds(4, count, 98765), shown)
+    episodes = draw_episodes(Expert(task), episode_seeds(4, count, 98765), shown)
     _, by_state, by_control = linearise_hold(
         task.system, episodes.plans[:, :-1], episodes.controls, task.control_period
     )

@@ -20,7 +20,6 @@ from lagros_benchmarks.worst_case.flights import (
     Episodes,
     Flights,
     draw_episodes,
-    expert_of,
     fly,
     law_of,
     random_pushes,
@@ -32,6 +31,7 @@ from lagros_envs.seeding import episode_seeds
 from lagros_envs.task import Task
 from lagros_policies.contraction.conformal import bound_statement, conformal_bound
 from lagros_policies.contraction.statement import Statement
+from lagros_policies.expert import Expert
 
 # Episodes that fly in one batch.
 _CHUNK = 500
@@ -122,7 +122,7 @@ def single_scores(
         bound: d_bar, in units of the state per second; None for that of the task's commands.
     """
     begun = perf_counter()
-    expert = expert_of(task)
+    expert = Expert(task)
     level = task.defaults.bound if bound is None else bound
     seeds = episode_seeds(seed, count, namespace)
     parts = [

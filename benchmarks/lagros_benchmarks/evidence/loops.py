@@ -19,7 +19,6 @@ from lagros_benchmarks.worst_case.flights import (
     Episodes,
     Law,
     draw_episodes,
-    expert_of,
     policy_law,
     tracked_by,
     tracking_law,
@@ -71,7 +70,7 @@ def loop_of(policy: Any, task: Task, seeds: Sequence[int]) -> Loop:
         UnfitError: The policy keeps a memory of its own.
     """
     tracker = tracked_by(policy)
-    episodes = draw_episodes(expert_of(task) if tracker is None else tracker, seeds, shown)
+    episodes = draw_episodes(Expert(task) if tracker is None else tracker, seeds, shown)
     if tracker is not None:
         return _around_plans(policy.name, tracker, episodes)
     law = policy_law(policy, episodes)

@@ -240,23 +240,27 @@ class SingleExpert(Expert):
         return {name: counted[name] for name in ("plans", "failed_plans")}
 
     def record(self) -> dict[str, Any]:
-        """Return metric, planner and feedback; see `Expert`."""
-        from lagros_policies.contraction.metric_files import region_record
-
+        """Return metric, if the task has one, planner and feedback; see `Expert`."""
         expert = self._policy.expert
-        metric: Any = expert.metric
-        check = metric.verification
+        metric = expert.known_metric
         return {
-            "metric": {
-                # The digest that the manifests of training data carry.
-                "sha256": hashlib.sha256(metric.coefficients.tobytes()).hexdigest(),
-                "alpha": metric.contraction_rate,
-                "chi": metric.condition_bound,
-                "nu": metric.control_weight,
-                "region": region_record(metric.region),
-                "verification": None if check is None else asdict(check),
-            },
+            "metric": None if metric is None else _metric_record(metric),
             "planner": asdict(expert.planner.settings),
             "law": expert.law_name,
             "feedback": asdict(expert.feedback),
         }
+
+
+def _metric_record(metric: Any) -> dict[str, Any]:
+    from lagros_policies.contraction.metric_files import region_record
+
+    check = metric.verification
+    return {
+        # The digest that the manifests of training data carry.
+        "sha256": hashlib.sha256(metric.coefficients.tobytes()).hexdigest(),
+        "alpha": metric.contraction_rate,
+        "chi": metric.condition_bound,
+        "nu": metric.control_weight,
+        "region": region_record(metric.region),
+        "verification": None if check is None else asdict(check),
+    }

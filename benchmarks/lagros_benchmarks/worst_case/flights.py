@@ -23,8 +23,7 @@ from lagros_envs.numbers import functions
 from lagros_envs.seeding import episode_streams
 from lagros_envs.sweep import closest_approach
 from lagros_envs.task import LARGEST_DISTANCE, Scenario, Task, distance_between
-from lagros_policies.expert import Expert, has_metric
-from lagros_policies.planning.planner import Planner, planner_of
+from lagros_policies.planning.planner import Planner
 from lagros_policies.planning.trajectory import Trajectory
 from lagros_policies.tube_mpc import TubeMpcPolicy
 
@@ -91,24 +90,6 @@ class Flights:
 def parts_of(states: FloatArray) -> list[FloatArray]:
     """Return the coordinates of states (..., n), as the rules of a task take them."""
     return list(np.moveaxis(states, -1, 0))
-
-
-@dataclass(frozen=True)
-class Planning:
-    """What stands in for the expert of a task without a metric: its planner, and no law."""
-
-    task: Task
-    planner: Planner
-    metric: None = None
-
-
-def expert_of(task: Task) -> Expert | Planning:
-    """Return planner and law u* of a task; the planner alone where it describes no metric.
-
-    Raises:
-        FileNotFoundError: Its metric has not been made.
-    """
-    return Expert(task) if has_metric(task) else Planning(task, planner_of(task))
 
 
 def plan_of(planner: Planner, scenario: Scenario) -> Trajectory:

@@ -19,11 +19,9 @@ from lagros_benchmarks.worst_case.flights import (
     Episodes,
     Flights,
     Law,
-    Planning,
     ahead,
     disc_gap,
     draw_episodes,
-    expert_of,
     fly,
     policy_law,
     random_pushes,
@@ -46,7 +44,6 @@ from lagros_envs.registry import find_task
 from lagros_envs.task import LARGEST_DISTANCE, Task
 from lagros_policies.contraction import ContractionMetric
 from lagros_policies.expert import Expert
-from lagros_policies.planning.planner import planner_of
 from lagros_policies.policy import BasePolicy
 
 # States and plans (b, n) to directions (b, n).
@@ -186,32 +183,14 @@ class SingleBench:
         self.tracks = tracked_by(policy) is not None
         self.policy = policy
         # One whose metric is a network is held against the tube of its own.
-        self.expert = cast(Any, self.policy.expert if self.tracks else self._expert(say))
+        self.expert = cast(Any, self.policy.expert if self.tracks else Expert(self.task))
         if self.tracks:
             # A plan that comes late on a busy machine must not change the figure.
             self.policy.deadline = math.inf
         self.episodes = draw_episodes(self.expert, self.settings.episode_seeds())
-        self.metric = self._metric(say)
+        self.metric = self.expert.known_metric
         if self.metric is not None:
             self._tracked = self.expert.track(self.episodes.plans, self.episodes.controls)
-
-    def _expert(self, say: Callable[[str], None]) -> Expert | Planning:
-        """Return planner and u*; the planner alone where the metric is still to be made."""
-        try:
-            return expert_of(self.task)
-        except FileNotFoundError as error:
-            say(f"without u* to hold the flights against: {error}")
-            return Planning(self.task, planner_of(self.task))
-
-    def _metric(self, say: Callable[[str], None]) -> Any:
-        """Return the metric that flights are held against; None where there is none."""
-        if isinstance(self.expert, Planning) or not self.expert.has_metric:
-            return None
-        try:
-            return self.expert.metric
-        except FileNotFoundError as error:
-            say(f"without a metric to hold the flights against: {error}")
-            return None
 
     def search(self, say: Callable[[str], None]) -> list[Found]:
         """Search the worst sequence of every episode."""
