@@ -115,6 +115,7 @@ BENCH = {
         (*WHOLE, "50"), ("spacecraft --scene scene.png",), ("spacecraft", "cartpole"), "1"
     ),
     "--episodes-file": Row(WRITTEN),
+    "--html": Row(WRITTEN),
     "--out": Row(FOLDERS),
 }
 REPRODUCE = {
@@ -135,6 +136,8 @@ WATCH = {
     "--scenario": Row(READ, SPACECRAFT, CARTPOLE, "scenario.json"),
     "--safety-filter": Row(FLAG, SPACECRAFT, CARTPOLE),
     "--video": Row((*WRITTEN, "film", "film.avi", "film.", ".gif")),
+    "--html": Row(WRITTEN),
+    "--browser": Row(FLAG),
     "--speed": Row(POSITIVE),
     "--seconds": Row(POSITIVE),
 }

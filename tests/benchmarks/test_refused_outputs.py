@@ -25,6 +25,7 @@ WORK = (
     "lagros_benchmarks.commands.train._train_one",
     "lagros_benchmarks.commands.export._written",
     "lagros_benchmarks.report.playback.Playback.play",
+    "lagros_benchmarks.report.playback.Playback.page",
     "lagros_benchmarks.run.demonstrations.demonstrate",
 )
 START = {
@@ -47,6 +48,7 @@ PATHS = {
     ("bench", "--figure"): ".png",
     ("bench", "--scene"): ".svg",
     ("bench", "--episodes-file"): ".jsonl",
+    ("bench", "--html"): ".html",
     ("bench", "--out"): "",
     ("reproduce", "--out"): "",
     ("attack", "--json"): ".json",
@@ -61,6 +63,7 @@ PATHS = {
     ("export", "--weights"): None,
     ("data export", "--out"): "",
     ("watch", "--video"): ".gif",
+    ("watch", "--html"): ".html",
     ("watch", "--scenario"): None,
 }
 WRITTEN = [(*key, suffix) for key, suffix in PATHS.items() if suffix is not None]
@@ -150,6 +153,7 @@ PAIRS = [
     ("bench", "--markdown", "--episodes-file"),
     ("bench", "--figure", "--scene"),
     ("bench", "--json", "--figure"),
+    ("bench", "--csv", "--html"),
     ("attack", "--json", "--npz"),
     ("train", "--json", "--figure"),
 ]

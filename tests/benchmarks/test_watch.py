@@ -295,7 +295,8 @@ def test_a_policy_that_plans_is_shown_with_its_plan(invoke, tmp_path):
     film = Playback(
         WatchSettings("spacecraft", policy="pilots:Planner", agents=2, video=tmp_path / "x.gif")
     )
-    film._game.start("rgb_array", 10.0)
+    film._game.begin()
+    film._game.open("rgb_array", 10.0)
     world = film._game.env.episode.world
     film._game.step()
     apart = world.nominal_now()[0, :, :2] - world.scenarios[0].starts

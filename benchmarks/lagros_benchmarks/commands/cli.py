@@ -168,6 +168,10 @@ def bench(
     episodes_file: Annotated[
         Path | None, file_option("Every episode (every agent), as JSON Lines.")
     ] = None,
+    html: Annotated[
+        Path | None,
+        file_option("One page for a browser: table, figures, and episodes to play side by side."),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -191,7 +195,7 @@ def bench(
     from lagros_policies.naming import listed_names, with_parts
     from lagros_policies.policy import policy_names
 
-    outputs = Outputs(json, csv, latex, markdown, figure, episodes_file, scene, scene_world)
+    outputs = Outputs(json, csv, latex, markdown, figure, episodes_file, scene, scene_world, html)
     named = None if policies is None else listed_names(policies)
     find_users_modules((task, *(named or ())))
     try:
@@ -359,7 +363,8 @@ def run_and_report(
         with progress_bar() as progress, redirect_stdout(sys.stderr), undone():
             run = run_benchmark(settings, progress=progress, kept=kept)
         rows = summarise(run)
-        delivery = outputs.write(run, rows)
+        with progress_bar() as progress:
+            delivery = outputs.write(run, rows, progress)
     except (SetupError, BackendError) as error:
         # No weights, damaged weights, an extra that is not installed, a cluster that is not there.
         fail(error, status=1)

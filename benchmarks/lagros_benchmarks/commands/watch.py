@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -46,6 +47,12 @@ def watch(
     video: Annotated[
         Path | None, file_option("Write a .gif or .mp4 instead of opening a window.")
     ] = None,
+    html: Annotated[
+        Path | None, file_option("Write a page for a browser that plays it, with its curves.")
+    ] = None,
+    browser: Annotated[
+        bool, typer.Option("--browser", help="Open that page; without --html, a temporary one.")
+    ] = False,
     speed: Annotated[
         float | None,
         typer.Option(help="How much faster than real time it plays; the task's own if not given."),
@@ -80,19 +87,21 @@ def watch(
             scenario=scenario,
             safety_filter=safety_filter,
             video=video,
+            page=browser or html is not None,
             speed=speed,
             seconds=seconds,
         )
         playback = Playback(settings)
-        check_outputs({"--video": video}, {"--scenario": scenario, **policy_files([policy])})
+        inputs = {"--scenario": scenario, **policy_files([policy])}
+        check_outputs({"--video": video, "--html": html}, inputs)
     except (ValueError, OSError) as error:
         fail(error)
     except (ImportError, SetupError) as error:
         fail(error, status=1)
     try:
-        film = playback.play()
+        film = playback.page().encode() if settings.page else playback.play()
     except KeyboardInterrupt:
-        if video is not None:
+        if video is not None or settings.page:
             raise
         raise typer.Exit from None
     except (ImportError, OSError, RuntimeError) as error:
@@ -101,9 +110,25 @@ def watch(
         playback.close()
     delivery = Delivery()
     content = film or b""
-    delivery.write(video, lambda path: write_atomic(path, content))
+    page = html or (_temporary() if browser else None)
+    delivery.write(page or video, lambda path: write_atomic(path, content))
     for line in playback.summary():
         typer.echo(line)
-    delivery.tell(f"{playback.frames} frames, {len(content) / 1e6:.2g} MB")
+    frames = "" if settings.page else f"{playback.frames} frames, "
+    delivery.tell(f"{frames}{len(content) / 1e6:.2g} MB")
+    if browser and page is not None:
+        _open(page)
     if playback.error is not None:
         raise typer.Exit(RAISED)
+
+
+def _temporary() -> Path:
+    """Return where a page may lie that nobody has named; the browser reads it when it pleases."""
+    return Path(tempfile.mkdtemp(prefix="lagros-")) / "episode.html"
+
+
+def _open(page: Path) -> None:
+    import webbrowser
+
+    if not webbrowser.open(page.resolve().as_uri()):
+        typer.echo(f"lagros: no browser can be opened here; open {page} yourself", err=True)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from lagros_benchmarks.run.experiment import BenchmarkRun, Row
+    from lagros_benchmarks.run.workers import Progress
     from lagros_envs.task import Described
 
 
@@ -34,6 +35,7 @@ class Outputs:
         episodes: Every episode (of worlds of agents every agent), one JSON object a line.
         scene: Trajectories of every policy in one world of agents.
         scene_world: Which world of the run that is, from 0.
+        html: The table, figures and episodes to play, as one page for a browser.
     """
 
     json: Path | None = None
@@ -44,6 +46,7 @@ class Outputs:
     episodes: Path | None = None
     scene: Path | None = None
     scene_world: int = 0
+    html: Path | None = None
 
     def check(
         self,
@@ -98,10 +101,19 @@ class Outputs:
             "--episodes-file": self.episodes,
             "--figure": self.figure,
             "--scene": self.scene,
+            "--html": self.html,
         }
 
-    def write(self, run: BenchmarkRun, rows: list[Row]) -> Delivery:
-        """Write the files, each on its own, and return what came of it."""
+    def write(
+        self, run: BenchmarkRun, rows: list[Row], progress: Progress | None = None
+    ) -> Delivery:
+        """Write the files, each on its own, and return what came of it.
+
+        Args:
+            run: The run.
+            rows: Its rows.
+            progress: Called while the episodes of the page fly.
+        """
         from lagros_benchmarks.report import figures, records, tables
         from lagros_benchmarks.run import files
 
@@ -115,6 +127,7 @@ class Outputs:
         )
         delivery.write(self.figure, lambda path: figures.draw(rows, path))
         delivery.write(self.scene, lambda path: _draw_scene(run, self.scene_world, path))
+        delivery.write(self.html, lambda path: _write_page(run, rows, path, progress))
         return delivery
 
 
@@ -122,6 +135,17 @@ def _draw_scene(run: BenchmarkRun, world: int, path: Path) -> None:
     # As in the run: what policies print is not ours, and where they go is no matter.
     with redirect_stdout(sys.stderr), undone():
         room_of(run.settings.description).part("scene")(run.settings, world, path)
+
+
+def _write_page(
+    run: BenchmarkRun, rows: Sequence[Row], path: Path, progress: Progress | None
+) -> None:
+    from lagros_benchmarks.report.page.assemble import bench_page
+    from lagros_benchmarks.run.files import write_atomic
+
+    with redirect_stdout(sys.stderr), undone():
+        page = bench_page(run, rows, progress)
+    write_atomic(path, page)
 
 
 def print_report(rows: Sequence[Row], console: Console | None = None) -> None:

@@ -48,7 +48,8 @@ class WatchSettings:
         seed: Seed of the episode, as for `env.reset`.
         scenario: File that `Scenario.save` has written; None draws one from the preset.
         safety_filter: Whether the policy uses the safety filter.
-        video: File to write; None opens a window.
+        video: File to write; None opens a window, unless a page is made.
+        page: Whether it is played in a page for a browser.
         speed: How much faster than real time it plays; None takes the task's own.
         seconds: End after so much time of the episode [s]; None plays to its end.
 
@@ -68,6 +69,7 @@ class WatchSettings:
     scenario: Path | None = None
     safety_filter: bool = False
     video: Path | None = None
+    page: bool = False
     speed: float | None = None
     seconds: float | None = None
 
@@ -99,6 +101,10 @@ class WatchSettings:
         if self.seconds is not None:
             check_positive("seconds", self.seconds)
         if self.video is not None:
+            if self.page:
+                raise ValueError(
+                    f"video={str(self.video)!r}: a page is asked for, too; leave one of them out"
+                )
             check_video_path(self.video)
 
     @property
@@ -130,7 +136,8 @@ class Playback:
     """
 
     def __init__(self, settings: WatchSettings) -> None:
-        import_pygame()
+        if not settings.page:
+            import_pygame()
         self.settings = settings
         self.frames = 0
         self._game: Any = room_of(settings.described).part("game")(settings)
@@ -163,6 +170,31 @@ class Playback:
         self._show()
         return None
 
+    def page(self) -> str:
+        """Play the episode to its end, and return it as a page for a browser."""
+        from lagros_benchmarks.report.page.assemble import page_text
+        from lagros_benchmarks.report.page.contents import of_episode
+
+        settings, game = self.settings, self._game
+        camera = room_of(settings.described).part("camera")()
+        game.begin()
+        camera.note(game.loop)
+        for _ in range(self._steps):
+            over = game.step()
+            if game.error is None:
+                camera.note(game.loop)
+            if over:
+                break
+        condition: dict[str, Any] = {
+            "disturbance": settings.disturbance,
+            "bound": settings.disturbance_bound,
+        }
+        if settings.described.most_agents > 1:
+            condition["agents"] = game.env.num_agents
+        reel = camera.reel(game.error)
+        content = of_episode(settings.described, settings.policy, condition, settings.seed, reel)
+        return page_text({**content, "speed": settings.playing_speed})
+
     @property
     def error(self) -> str | None:
         """What the policy raised; None if nothing."""
@@ -193,7 +225,8 @@ class Playback:
         return lines
 
     def _drawn(self) -> Iterator[Frame]:
-        self._game.start("rgb_array", self._rate)
+        self._game.begin()
+        self._game.open("rgb_array", self._rate)
         for frame in self._frames():
             yield frame
         for _ in range(round(_PAUSE * self._rate)):
@@ -201,8 +234,10 @@ class Playback:
 
     def _show(self) -> None:
         pygame = import_pygame()
+        # First: a window would stand still while this plans.
+        self._game.begin()
         try:
-            self._game.start("human", self._rate)
+            self._game.open("human", self._rate)
         except pygame.error as error:
             raise RuntimeError(f"no window can be opened here ({error}); {_USE_VIDEO}") from error
         # Without a display SDL draws where nobody sees it, and says so in the driver's name alone.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -29,7 +30,7 @@ class SingleGame:
     divisible = True  # There are pictures between the control instants.
     error: str | None = None
     env: Any
-    _loop: ClosedLoop
+    loop: ClosedLoop
     _pictures: Any = None
 
     def __init__(self, settings: WatchSettings) -> None:
@@ -44,31 +45,33 @@ class SingleGame:
         first = ClosedLoop(self.env, make_single_policy(settings.policy, self.env))
         first.rehearse(name, settings.seed)
         # Another one flies: a policy may count its calls without being told.
-        self._loop = ClosedLoop(self.env, make_single_policy(settings.policy, self.env))
+        self.loop = ClosedLoop(self.env, make_single_policy(settings.policy, self.env))
 
-    def start(self, render_mode: str, rate: float) -> None:
-        """Begin the episode, with its plan, and open the window or what draws without one."""
+    def begin(self) -> None:
+        """Begin the episode, with its plan."""
         plan = plan_of(planner_of(self.env.settings), self.env.scenario)
         options = {"nominal": np.asarray(plan.states)} if plan.solved else {}
-        self._loop.begin(self._seed, options)
-        # Only now: a window would stand still while this plans.
+        self.loop.begin(self._seed, options)
+
+    def open(self, render_mode: str, rate: float) -> None:
+        """Open the window, or what draws without one."""
         self._pictures = SinglePictures(self.env, render_mode, rate)
 
     def step(self) -> bool:
         """Take a control step; return whether the episode is over."""
         with Attempt() as attempt:
-            self._loop.decide()
+            self.loop.decide()
         self.error = attempt.error
         if self.error is not None:
             return True
         if self.divisible and self._pictures is not None:
-            self._pictures.hold(self._loop.action)
-        self._loop.move()
-        return self._loop.over
+            self._pictures.hold(self.loop.action)
+        self.loop.move()
+        return self.loop.over
 
     def draw(self, part: float) -> Frame | None:
         """Draw where a part of the last control step has led: a frame, or None in a window."""
-        frame: Frame | None = self._pictures.draw(part, self._loop.info["disturbance"])
+        frame: Frame | None = self._pictures.draw(part, self.loop.info["disturbance"])
         return frame
 
     def close(self) -> None:
@@ -78,17 +81,26 @@ class SingleGame:
 
     def counters(self) -> dict[str, int]:
         """Return what the policy counts."""
-        return self._loop.counters()
+        return self.loop.counters()
 
     def outcome(self) -> str:
         """Return what the episode came to, in one line."""
-        info = self._loop.info
-        success = info["success"] and self.error is None
-        reached = f"success at {info['success_time']:.1f} s" if success else "no success"
-        end = "collided" if info.get("collided") else "fallen" if info["fallen"] else "not fallen"
-        unit = self.env.settings.squared_unit
-        spent = efforts("effort", info["effort_to_success"], info["effort"], unit)
-        return f"{reached}, {end}, {spent}"
+        return outcome(self.loop.info, self.error, self.env.settings.squared_unit)
+
+
+def outcome(info: Mapping[str, Any], error: str | None, unit: str) -> str:
+    """Return what an episode came to by its last info, in one line.
+
+    Args:
+        info: Of the environment.
+        error: The exception that ended it, or None.
+        unit: Of the control, squared; "" for none.
+    """
+    success = info["success"] and error is None
+    reached = f"success at {info['success_time']:.1f} s" if success else "no success"
+    end = "collided" if info.get("collided") else "fallen" if info["fallen"] else "not fallen"
+    spent = efforts("effort", info["effort_to_success"], info["effort"], unit)
+    return f"{reached}, {end}, {spent}"
 
 
 def efforts(what: str, to_success: float, to_end: float, unit: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -102,13 +102,15 @@ def run_episode(
     *,
     label: str | None = None,
     initial_error: FloatArray | None = None,
+    watch: Callable[[ClosedLoop], None] | None = None,
 ) -> EpisodeRecord:
     """Run one episode in an environment of one body to its end.
 
     An exception in the policy or the environment ends the episode as a failure that is written
     down with its text; it is never raised and the episode is never dropped. The plan is x_d
     at every control instant, shape (steps + 1, n), or None where there is none. With an initial
-    error, shape (n,), the body begins beside the initial state that the policy is told.
+    error, shape (n,), the body begins beside the initial state that the policy is told. Who watches
+    is shown the loop at every control instant.
     """
     loop = ClosedLoop(env, policy)
     errors: list[float] = []
@@ -117,6 +119,8 @@ def run_episode(
     options = {name: value for name, value in given.items() if value is not None}
     with Attempt() as attempt:
         for _ in loop.fly(seed, options):
+            if watch is not None:
+                watch(loop)
             if "tracking_error" in loop.info:
                 error = float(loop.info["tracking_error"])
                 # A state that overflowed is infinitely far away, not unmeasured.

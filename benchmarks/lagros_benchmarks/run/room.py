@@ -26,6 +26,8 @@ class Room:
         figures: Draws rows into a file; None, as in all that follow, where there is no such thing.
         scene: Draws what every policy made of one world of a run.
         fly_scene: Flies that world.
+        reels: Flies episodes again for a page in a browser.
+        camera: Notes what such a page shows of an episode, a `report.page.reels.Camera`.
         reproduced: Name of the figure of `lagros reproduce`.
         game: What `lagros watch` plays.
         attack: Episodes and search of an attack, a `worst_case.single.SingleBench`.
@@ -43,6 +45,8 @@ class Room:
     figures: str | None = "lagros_benchmarks.report.single_figures:draw"
     scene: str | None = None
     fly_scene: str | None = None
+    reels: str = "lagros_benchmarks.report.page.single:SingleReels"
+    camera: str = "lagros_benchmarks.report.page.single:SingleCamera"
     reproduced: str = "error.png"
     game: str | None = "lagros_benchmarks.report.watched:SingleGame"
     attack: str = "lagros_benchmarks.worst_case.single:SingleBench"

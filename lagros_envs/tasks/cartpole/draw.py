@@ -27,13 +27,13 @@ from lagros_envs.canvas import (
     mix,
 )
 from lagros_envs.draw import Frame
+from lagros_envs.tasks.cartpole.task import CART_SIZE, HINGE_HEIGHT
 
 if TYPE_CHECKING:
     from lagros_envs.tasks.cartpole.task import CartPoleSettings
 
 WIDTH, HEIGHT = 800, 400  # [px]
 RAIL_HEIGHT = 352  # of the rail, from the top [px]
-CART_SIZE = (0.52, 0.26)  # width, height [m]
 SMALLEST_SPAN = 7.0  # width of the view when cart and goal are close [m]
 MARGIN = 1.5  # kept beside cart and goal [m] ...
 MARGIN_PIXELS = 110  # ... and at least this, where an arrow fits [px]
@@ -184,7 +184,7 @@ class CartPoleRenderer(Canvas):
 
     def _pole(self, state: FloatArray, half_length: float) -> tuple[Point, Point]:
         """Return where hinge and tip of the pole are; a positive angle leans to the right."""
-        above = 1.15 * CART_SIZE[1]
+        above = HINGE_HEIGHT
         along, angle, length = float(state[0]), float(state[1]), 2.0 * half_length
         return (
             self._point(along, above),

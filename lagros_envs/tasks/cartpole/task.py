@@ -26,6 +26,10 @@ from lagros_envs.values import use_plain_numbers
 
 STATE_DIM = 4
 FALL_ANGLE = math.pi / 2  # [rad]
+# How it is drawn.
+CART_SIZE = (0.52, 0.26)  # width, height [m]
+HINGE_HEIGHT = 1.15 * CART_SIZE[1]  # of the pole's lower end, above the rail [m]
+_POLE_WIDTH = 0.08  # [m]
 # Where each named part of the observation lies.
 LAYOUT = Layout(STATE_DIM, 0)
 STATE, GOAL, INITIAL_STATE, TIME = LAYOUT.state, LAYOUT.goal, LAYOUT.initial_state, LAYOUT.time
@@ -164,6 +168,16 @@ class CartPoleSettings(Task):
         from lagros_envs.tasks.cartpole.draw import CartPoleRenderer
 
         return CartPoleRenderer(self, render_mode, fps)
+
+    def outline(self, state: FloatArray) -> Sequence[FloatArray]:
+        """Return cart and pole; a positive angle leans to the right."""
+        half, high = 0.5 * CART_SIZE[0], CART_SIZE[1]
+        cart = np.array([[-half, 0.0], [half, 0.0], [half, high], [-half, high]])
+        along = np.array([math.sin(state[1]), math.cos(state[1])])
+        side = 0.5 * _POLE_WIDTH * np.array([along[1], -along[0]])
+        hinge, tip = np.array([0.0, HINGE_HEIGHT]), 2.0 * self.system.half_length * along
+        pole = hinge + np.array([side, -side, tip - side, tip + side])
+        return [np.array([state[0], 0.0]) + part for part in (cart, pole)]
 
     def _scenarios(self, shares: FloatArray) -> Scenario:
         """Return scenarios from theta_0 and p_f as shares of their ranges, shape (count, 2)."""

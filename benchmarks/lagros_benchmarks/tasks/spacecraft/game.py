@@ -64,14 +64,16 @@ class SpacecraftGame(SingleGame):
         first.rehearse(f"policy {settings.policy!r}", self._seed, self._options)
         # Others fly: a policy may count its calls without being told.
         self._planner, policy = self._built()
-        self._loop = _World(self.env, policy)
+        self.loop = _World(self.env, policy)
 
-    def start(self, render_mode: str, rate: float) -> None:
-        """Begin the episode, with its plan, and open the window or what draws without one."""
+    def begin(self) -> None:
+        """Begin the episode, with its plan."""
         nominal = self._nominal()
         options = {} if nominal is None else {"nominal": nominal}
-        self._loop.begin(self._seed, self._options | options)
-        # Only now: a window would stand still while this plans.
+        self.loop.begin(self._seed, self._options | options)
+
+    def open(self, render_mode: str, rate: float) -> None:
+        """Open the window, or what draws without one."""
         fps = max(1, round(rate))
         self._pictures = SpacecraftRenderer(render_mode, fps, self.env.preset.arena)
 
@@ -82,7 +84,7 @@ class SpacecraftGame(SingleGame):
 
     def outcome(self) -> str:
         """Return what the episode came to, in one line."""
-        infos = self._loop.info.values()
+        infos = self.loop.info.values()
         count = len(infos)
         arrived = sum(info["success"] for info in infos)
         collided = sum(info["collided"] for info in infos)
@@ -95,7 +97,7 @@ class SpacecraftGame(SingleGame):
 
     def _nominal(self) -> Any:
         """Return x_d (steps + 1, agents, 6) if the policy plans it at the start, else None."""
-        if self._loop.policy.observes == "local":
+        if self.loop.policy.observes == "local":
             return None
         with Attempt():  # what it raises, it will raise in the episode
             plan = _World(self._still, self._planner)
