@@ -32,7 +32,6 @@ def of_rows(rows: Sequence[Row], task: Described) -> Content:
     first, whole = rows[0], [tables.texts(group[0]).ordered(group) for group in groups]
     series = _series(rows)
     columns = tables.texts(first).columns(first)
-    effort = next(unit for heading, unit, _ in columns if heading in ("effort", "∫‖u‖²"))
     return {
         **_of_task(task),
         "title": f"{task.title}, {first['episodes']} episodes, seed {first['seed']}",
@@ -41,7 +40,7 @@ def of_rows(rows: Sequence[Row], task: Described) -> Content:
         "legend": tables.legend(rows),
         "lines": [*names_lines(rows), *tables.error_lines(rows)],
         "columns": [[heading, unit] for heading, unit, _ in columns],
-        "effort": effort,
+        "effort": (first.get("units") or {"effort": "N²s"})["effort"],
         "series": list(series.values()),
         "conditions": [
             _condition(group[0], list(tables.comparison_lines(group))) for group in groups

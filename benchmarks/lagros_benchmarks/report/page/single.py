@@ -227,7 +227,15 @@ class SingleReels:
 
 def _again(env: Any, policy: Any, plan: NominalPlan, record: EpisodeRecord) -> Reel | None:
     camera = SingleCamera()
-    again = run_episode(env, policy, plan.seed, plan.states, label=record.policy, watch=camera.note)
+    again = run_episode(
+        env,
+        policy,
+        plan.seed,
+        plan.states,
+        label=record.policy,
+        initial_error=plan.initial_error,
+        watch=camera.note,
+    )
     try:
         reel = camera.reel(again.error, record.error_bounds)
     except ValueError:
