@@ -161,6 +161,7 @@ def test_what_raises_is_a_failure_and_the_status_says_so(mine, tmp_path):
         (["bench", PENDULUM, "--disturbance", "worst"], 2, "`lagros attack gym:Pendulum-v1`"),
         (["bench", PENDULUM, "--guarantee"], 2, "has a plan"),
         (["bench", PENDULUM, "--figure", "a.png"], 2, "no figure of gym:Pendulum-v1"),
+        (["bench", PENDULUM, "--html", "a.html"], 2, "no page of gym:Pendulum-v1"),
         (["bench", PENDULUM, "--agents", "2"], 2, "is one body"),
         (["bench", PENDULUM, "--channels", "rates"], 1, "which of the 2 coordinates are rates"),
         (["attack", PENDULUM], 2, "unknown policy 'lagros'"),

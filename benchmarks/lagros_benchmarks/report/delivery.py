@@ -67,7 +67,7 @@ class Outputs:
 
         Raises:
             ValueError: A file cannot be written, two are one, a figure has an unknown suffix, or
-                the task has no such figure or scene.
+                the task has no such figure, scene or page.
         """
         for option in ("--figure", "--scene"):
             path = self._paths[option]
@@ -80,6 +80,8 @@ class Outputs:
                     raise ValueError(f"{option}: {error}") from None
         if self.figure is not None and task is not None and room_of(task).figures is None:
             raise ValueError(f"--figure: there is no figure of {task.name}; leave it out")
+        if self.html is not None and task is not None and room_of(task).reels is None:
+            raise ValueError(f"--html: there is no page of {task.name}; leave it out")
         if self.scene is not None:
             if task is None or room_of(task).scene is None:
                 name = "the task" if task is None else task.name

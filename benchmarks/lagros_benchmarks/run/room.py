@@ -45,8 +45,8 @@ class Room:
     figures: str | None = "lagros_benchmarks.report.single_figures:draw"
     scene: str | None = None
     fly_scene: str | None = None
-    reels: str = "lagros_benchmarks.report.page.single:SingleReels"
-    camera: str = "lagros_benchmarks.report.page.single:SingleCamera"
+    reels: str | None = "lagros_benchmarks.report.page.single:SingleReels"
+    camera: str | None = "lagros_benchmarks.report.page.single:SingleCamera"
     reproduced: str = "error.png"
     game: str | None = "lagros_benchmarks.report.watched:SingleGame"
     attack: str = "lagros_benchmarks.worst_case.single:SingleBench"

@@ -169,6 +169,10 @@ class CartPoleSettings(Task):
 
         return CartPoleRenderer(self, render_mode, fps)
 
+    def place(self, state: FloatArray) -> FloatArray:
+        """Return where the middle of the cart is."""
+        return np.array([state[0], 0.5 * CART_SIZE[1]])
+
     def outline(self, state: FloatArray) -> Sequence[FloatArray]:
         """Return cart and pole; a positive angle leans to the right."""
         half, high = 0.5 * CART_SIZE[0], CART_SIZE[1]

@@ -128,35 +128,31 @@ def _scene(task: Task, scenario: Any, nominal: FloatArray | None) -> dict[str, A
 def _drawn(task: Task, states: FloatArray) -> dict[str, FloatArray | None]:
     """Return places (instants, 1, 2) of a body and its polygons (instants, corners, 2).
 
-    A body that is a disc has its heading beside its place. One that has polygons and no position,
-    as a pole that is all angles, is where the middle of its first polygon is.
+    A body that is a disc has its heading beside its place.
     """
-    outlines = [[np.asarray(one) for one in task.outline(state)] for state in states]
-    polygons = np.array([np.concatenate(one) for one in outlines]) if outlines[0] else None
-    if task.position:
-        places = states[:, list(task.position)]
-    elif polygons is not None:
-        places = np.array([one[0].mean(axis=0) for one in outlines])
-    else:
+    places = _places(task, states)
+    if not places.size:
         return {"places": None, "polygons": None}
+    outlines = [task.outline(state) for state in states]
+    polygons = np.array([np.concatenate(one) for one in outlines]) if outlines[0] else None
     if polygons is None:
         moves = np.diff(places, axis=0, append=2.0 * places[-1:] - places[-2:-1])
         places = np.column_stack([places, np.arctan2(moves[:, 1], moves[:, 0])])
     return {"places": places[:, None], "polygons": polygons}
 
 
+def _places(task: Task, states: FloatArray) -> FloatArray:
+    return np.array([task.place(state) for state in states])
+
+
 def _slopes(task: Task, states: FloatArray) -> FloatArray:
     """Return the slopes of the body's place by its state, (instants, 2, n)."""
-    count = states.shape[1]
-    if task.position:
-        return np.broadcast_to(np.eye(count)[list(task.position)], (len(states), 2, count))
-    slopes = np.empty((len(states), 2, count))
-    for entry, shift in enumerate(_STEP * np.eye(count)):
-        ends = [_drawn(task, states + sign * shift)["places"] for sign in (1.0, -1.0)]
-        assert ends[0] is not None
-        assert ends[1] is not None
-        slopes[..., entry] = (ends[0] - ends[1])[:, 0, :2] / (2.0 * _STEP)
-    return slopes
+    shifts = _STEP * np.eye(states.shape[1])
+    columns = [
+        (_places(task, states + shift) - _places(task, states - shift)) / (2.0 * _STEP)
+        for shift in shifts
+    ]
+    return np.stack(columns, axis=-1)
 
 
 def _cut(values: FloatArray | None, box: FloatArray, name: str) -> FloatArray | None:
@@ -174,6 +170,8 @@ def _arrows(task: Task, states: FloatArray, pushes: FloatArray) -> FloatArray:
     arrows = [np.einsum("kin,kn->ki", slopes, pushes)]
     rates = list(task.rates)
     others = [entry for entry in range(states.shape[1]) if entry not in rates]
+    if len(rates) == len(task.position):
+        others = list(task.position)
     if len(rates) == len(others):
         arrows.append(np.einsum("kin,kn->ki", slopes[..., others], pushes[:, rates]))
     return np.concatenate(arrows, axis=-1)[:, None]

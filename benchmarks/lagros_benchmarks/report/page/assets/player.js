@@ -27,7 +27,8 @@ function makePlayer() {
   const [speedLabel, speed] = choice("Speed", "speed", speeds.map((one) => [one, `× ${one}`]));
   speed.value = DATA.speed;
   byId("controls").append(play, back, on, slider, clock, speedLabel);
-  byId("hint").textContent = "Keys: space plays and stops; ← → one step, with shift ten; Home and End; N and P the next and the previous episode.";
+  byId("hint").textContent = "Keys: space plays and stops; ← → one step, with shift ten; Home and End"
+    + (DATA.episodes.length > 1 ? "; N and P the next and the previous episode." : ".");
 
   const duration = () => Math.max(...shown().map(({ flight }) => lastOf(decode(flight).times)), state.period);
   const lastOf = (times) => times.values[times.values.length - 1];
@@ -124,7 +125,7 @@ function makePlayer() {
     if (measures.error) said.push(`‖x − x_d‖ ${number(at(measures.error)[0])}`);
     if (states) at(states).forEach((value, k) => {
       const [, name, unit] = /^(.*?)(?: \[(.*)\])?$/.exec(DATA.states[k]);
-      said.push(`${name} ${value.toFixed(2).replace(/^-(0\.00)$/, "$1").replace("-", "−")}${unit ? ` ${unit}` : ""}`);
+      said.push(`${name} ${value.toFixed(2).replace(/^-(0\.00)$/, "$1").replace("-", "−")}${unit && unit !== "-" ? ` ${unit}` : ""}`);
     });
     return said.join(" · ");
   }
