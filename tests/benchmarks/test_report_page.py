@@ -159,12 +159,11 @@ def test_every_task_of_one_body_has_a_page(task):
             states = unpacked(flight["parts"]["states"])
             assert states.shape[1] == described.system.state_dim
             assert np.isfinite(states).all()
-            if described.position:
-                places = unpacked(flight["parts"]["places"])[:, 0, :2]
-                at = states[:, list(described.position)]
-                inside = np.abs(at).max(axis=-1) < 50.0
-                np.testing.assert_allclose(places[inside], at[inside], atol=0.05)
-                assert "push" in flight["parts"]
+            places = unpacked(flight["parts"]["places"])[:, 0, :2]
+            at = np.array([described.place(state) for state in states])
+            inside = np.abs(states).max(axis=-1) < 50.0
+            np.testing.assert_allclose(places[inside], at[inside], atol=0.05)
+            assert unpacked(flight["parts"]["push"]).shape[:2] == (len(states), 1)
 
 
 def test_worlds_of_agents_have_a_page():
