@@ -59,12 +59,8 @@ def test_networks_belong_to_the_task_and_to_their_policy(task, policy):
         policy(type(task)(time_limit=2.0 * task.time_limit))
 
 
-<<<<<<< HEAD
-def test_one_evaluation_flies_to_the_goal_clear_of_the_discs(task):
-=======
 @pytest.mark.parametrize("kind", ["uniform", "constant"])
-def test_one_evaluation_flies_among_the_discs(task, kind):
->>>>>>> d3c37ce (Fly the car with a firmer law, more room and a network that keeps its plan; publish it)
+def test_one_evaluation_flies_to_the_goal_clear_of_the_discs(task, kind):
     seeds = episode_seeds(0, 60, _TEST)
     episodes = [task.sample(episode_streams(seed).scenario) for seed in seeds]
     size = task.steps, task.system.state_dim, task.control_period
