@@ -5,7 +5,7 @@ Networks need the extra `train`, too.
     lagros check examples/ball_beam.py
     lagros certify examples/ball_beam.py --policy tube-mpc
     lagros reproduce examples/ball_beam.py      # networks (a) and (c)
-    lagros certify examples/ball_beam.py --policy lagros --bound 0.01
+    lagros certify examples/ball_beam.py --policy lagros --bound 0.005
 """
 
 from collections.abc import Sequence

@@ -119,16 +119,14 @@ def errors_between(
     control, reach = controls[known], boxes[:, :-1][known]
     force = _around(control, deviation[known])
     pushes = [Interval(-one, one) if one > 0.0 else 0.0 for one in push.tolist()]
+    nothing, still = np.zeros_like(control), [0.0] * len(push)
+    planned_from = _around(begin, 0.0 * reach), _around(control, nothing), still, period
     try:
-        flown = holds(system, _around(begin, reach), force, pushes, period)
-        nothing = np.zeros_like(control)
-        still = [0.0] * len(push)
-        planned = holds(
-            system, _around(begin, 0.0 * reach), _around(control, nothing), still, period
-        )
-        step = rk4_hold(
-            system, _around(begin, 0.0 * reach), _around(control, nothing), still, period, functions
-        )
+        # Sets that grow until they overflow hold nothing, and are known to.
+        with np.errstate(over="ignore", invalid="ignore"):
+            flown = holds(system, _around(begin, reach), force, pushes, period)
+            planned = holds(system, *planned_from)
+            step = rk4_hold(system, *planned_from, functions)
     except (ArithmeticError, ValueError):
         return between
     following = states[:, 1:][known]
@@ -139,7 +137,8 @@ def errors_between(
     size = np.abs(directions).T
     ends = np.maximum(outputs[:, :-1][known], outputs[:, 1:][known] + defect @ size * _WIDE)
     found = (ends + (0.125 * period * period) * (bend @ size)) * _WIDE
-    between[known] = np.where((flown.known & planned.known)[:, None], found, np.inf)
+    shown = (flown.known & planned.known)[:, None] & ~np.isnan(found)
+    between[known] = np.where(shown, found, np.inf)
     return between
 
 

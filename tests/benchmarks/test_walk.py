@@ -24,7 +24,7 @@ from lagros_envs.task import Learning
 from lagros_policies.room import shipped_file
 from tests.found import SINGLE_BODY, TASKS, named, task_of
 
-TINY = Learning(20, 400, hidden=(8, 8), epochs=1, learned_epochs=1, mpc_samples=0)
+TINY = Learning(20, 400, hidden=(8, 8, 8), epochs=1, learned_epochs=1, mpc_samples=0)
 
 
 @pytest.fixture
