@@ -104,6 +104,7 @@ BENCH = {
     "--address": Row(("",), ("cartpole --backend dask",), ("cartpole",), "tcp://127.0.0.1:1"),
     "--timing-episodes": Row(POSITIVE_WHOLE),
     "--guarantee": Row(FLAG, CARTPOLE, SPACECRAFT),
+    "--initial-error": Row(NUMBER, CARTPOLE, SPACECRAFT, "0.1"),
     "--replan-every": Row(POSITIVE_WHOLE, CARTPOLE, ("spacecraft", "cartpole --policies lqr"), "2"),
     "--json": Row(WRITTEN),
     "--csv": Row(WRITTEN),
@@ -210,6 +211,25 @@ DATA = {
     "--bound": Row((*NUMBER, *BOUND), MINARI, ("--minari --disturbance none",), "0.5"),
     "--out": Row(FOLDERS, MINARI),
 }
+SUITE = {
+    "--policies": Row(lists(POLICIES, "lagros"), CARTPOLE),
+    "--episodes": Row(POSITIVE_WHOLE, CARTPOLE),
+    "--fewer": Row(
+        ("", "mpc", "mpc=", "=3", "mpc=x", "mpc=0", "mpc=1.5", "mpc=201", "mpc=2,", LONG), CARTPOLE
+    ),
+    "--worlds": Row(POSITIVE_WHOLE, SPACECRAFT),
+    "--disturbance": Row(KINDS),
+    "--initial-error": Row(NUMBER, CARTPOLE),
+    "--proved": Row(WHOLE, CARTPOLE),
+    "--seed": Row(WHOLE),
+    "--jobs": Row(POSITIVE_WHOLE),
+    "--from": Row(READ),
+    "--json": Row(WRITTEN),
+    "--markdown": Row(WRITTEN),
+    "--figure": Row(FIGURES),
+    "--out": Row(FOLDERS),
+    "tasks": Row(NAMES, ("",)),
+}
 ROWS = {
     "": {"--version": Row(FLAG, ("",))},
     "bench": BENCH | {"task": Row(NAMES, ("",))},
@@ -221,6 +241,7 @@ ROWS = {
     "train": TRAIN | {"task": Row(NAMES, ("",))},
     "attack": ATTACK | {"task": Row(NAMES, ("",))},
     "data export": DATA,
+    "suite": SUITE,
 }
 
 
@@ -271,6 +292,7 @@ def invoke(tmp_path, monkeypatch):
         "tasks.spacecraft.certify.make_worlds",
         "tasks.spacecraft.certify._of_the_network",
         "commands.train._train_one",
+        "run.suite.fly_task",
         "worst_case.attack.run_attack",
         "worst_case.attack.fly_again",
         "commands.export._written",

@@ -18,6 +18,7 @@ from lagros_benchmarks.commands.extras import check_extra
 from lagros_benchmarks.commands.new import new
 from lagros_benchmarks.commands.outputs import check_outputs, policy_files
 from lagros_benchmarks.commands.streams import printing_failed
+from lagros_benchmarks.commands.suite import suite
 from lagros_benchmarks.commands.terminal import (
     Command,
     Commands,
@@ -331,6 +332,7 @@ app.command(cls=Command)(export)
 app.command(cls=Command)(certify)
 app.command(cls=Command)(train)
 app.command(cls=Command)(attack)
+app.command(cls=Command)(suite)
 app.add_typer(data, name="data")
 
 
