@@ -16,7 +16,7 @@ from lagros_envs.registry import find_task
 
 SLIDE = str(Path(__file__).parent / "toys.py") + ":Slide"
 POLICIES = "tube-mpc,lqr,sd-lqr,ppo"
-SUITE = ["--policies", POLICIES, "--episodes", "6", "--fewer", "lqr=2", "--proved", "1"]
+SUITE = ["--policies", POLICIES, "--episodes", "3", "--fewer", "lqr=2", "--proved", "1"]
 SUITE += ["--seed", "4", "--initial-error", "0.05"]
 
 
@@ -38,7 +38,7 @@ def test_the_rows_are_those_of_the_benchmark(flown, tmp_path):
     out, result = flown
     assert (out / "all.png").stat().st_size > 1000
     path = tmp_path / "rows.json"
-    words = ["--policies", "tube-mpc,sd-lqr", "--episodes", "6", "--seed", "4"]
+    words = ["--policies", "tube-mpc,sd-lqr", "--episodes", "3", "--seed", "4"]
     words += ["--disturbance", "uniform,constant", "--bound", "0.1"]
     for error in ("0", "0.05"):
         invoke("bench", SLIDE, *words, "--initial-error", error, "--json", str(path))
@@ -62,7 +62,7 @@ def test_every_condition_is_there_and_what_is_missing_is_said(flown):
         if not row["guarantee"]
     }
     assert conditions == {
-        (policy, kind, error, 2 if policy == "lqr" else 6)
+        (policy, kind, error, 2 if policy == "lqr" else 3)
         for policy in ("tube-mpc", "lqr", "sd-lqr")
         for kind in ("uniform", "constant")
         for error in (0.0, 0.05)
@@ -87,7 +87,7 @@ def test_the_page_has_a_line_for_every_policy(flown):
     ]
     assert len({line.count("|") for line in lines}) == 1
     assert "Not flown: ppo (" in section
-    assert "6 paired episodes (lqr 2)" in text
+    assert "3 paired episodes (lqr 2)" in text
     # Without one of the rivals nothing is claimed.
     assert "not all of them flew slider" in text
 
