@@ -110,19 +110,22 @@ def _check_shapes(task: Task) -> None:
     _check_parts(task)
     if task.metric is not None:
         _check_metric(task.metric, n, m)
-    if task.feedback is not None:
-        _numbers("feedback.state_weights", task.feedback.state_weights, n, "state", False)
-        _numbers("feedback.control_weights", task.feedback.control_weights, m, "control", False)
-        _numbers("feedback.early_state", task.feedback.early_state, n, "state")
-        _numbers("feedback.early_control", task.feedback.early_control, m, "control")
-        check_positive("feedback.rate", task.feedback.rate)
-        check_positive("feedback.settling", task.feedback.settling)
+    for name in ("feedback", "regulator"):
+        weights: Feedback | None = getattr(task, name)
+        if weights is not None:
+            _numbers(f"{name}.state_weights", weights.state_weights, n, "state", False)
+            _numbers(f"{name}.control_weights", weights.control_weights, m, "control", False)
+            _numbers(f"{name}.early_state", weights.early_state, n, "state")
+            _numbers(f"{name}.early_control", weights.early_control, m, "control")
+            check_positive(f"{name}.rate", weights.rate)
+            check_positive(f"{name}.settling", weights.settling)
 
 
 def _check_parts(task: Task) -> None:
     kinds: dict[str, tuple[type, ...]] = {
         "metric": (MetricDesign,),
         "feedback": (Feedback,),
+        "regulator": (Feedback,),
         "learning": (Learning,),
         "weights": (Path, str),
     }

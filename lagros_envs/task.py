@@ -180,6 +180,8 @@ class Task(Described):
         success_bonus: Reward at the first success.
         metric: The contraction metric; None for none.
         feedback: What u* prefers, and the weights of the regulators; None for Bryson's rule.
+        regulator: Weights of the regulator of the goal, `lqr`, whose errors are as long as the way;
+            None for those of the others.
         learning: How its networks are made; None for none.
         weights: Folder of its metric and networks; None for that of its `lagros reproduce`,
             `runs/reproduce-NAME` from the working directory.
@@ -206,6 +208,7 @@ class Task(Described):
     short_goal: ClassVar[tuple[int, ...]] = ()
     metric: ClassVar[MetricDesign | None] = None
     feedback: ClassVar[Feedback | None] = None
+    regulator: ClassVar[Feedback | None] = None
     learning: ClassVar[Learning | None] = None
     weights: ClassVar[Path | None] = None
     features: ClassVar[Callable[..., Sequence[Any]] | None] = None

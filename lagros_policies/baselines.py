@@ -66,7 +66,8 @@ class LqrPolicy(BasePolicy):
 
     Args:
         settings: The task; None for the paper's.
-        state_weights: Diagonal of Q, shape (n,); None for those of `regulator_weights`.
+        state_weights: Diagonal of Q, shape (n,); None for `task.regulator`, or
+            where that is None for those of `regulator_weights`.
         control_weights: Diagonal of R, shape (m,), or a number for all; None likewise.
         force_weight: Older name of `control_weights`.
 
@@ -98,7 +99,7 @@ class LqrPolicy(BasePolicy):
         self._named = "control_weights"
         if force_weight is not None:
             self._named, control_weights = "force_weight", (force_weight,) * m
-        usual = regulator_weights(task)
+        usual = task.regulator or regulator_weights(task)
         control: Any
         control = usual.control_weights if control_weights is None else control_weights
         if np.ndim(control) == 0:

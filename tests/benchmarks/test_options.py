@@ -17,6 +17,7 @@ import typer.main
 from typer.testing import CliRunner
 
 from lagros_benchmarks.commands import cli
+from lagros_benchmarks.commands.terminal import task_in_preset
 
 LONG = "x" * 100_000
 NAMES = ("", "nonsense", "None", "ünï🚀", "a b", "-", "--", LONG, "a\0b", "a\nb", "../x")
@@ -415,3 +416,13 @@ def test_the_installed_program_refuses_in_one_line_too(tmp_path, arguments):
     assert arguments[2] in done.stderr
     assert not done.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == ["binary", "folder"]
+
+
+def test_a_preset_of_one_body_is_a_task_and_that_of_many_agents_an_option():
+    assert task_in_preset("quadrotor", "10") == ("quadrotor-10", None)
+    assert task_in_preset("quadrotor", "9") == ("quadrotor", None)
+    assert task_in_preset("spacecraft", "open") == ("spacecraft", "open")
+    # One body without presets: whoever asks for one is told so by the command.
+    assert task_in_preset("pvtol", "open") == ("pvtol", "open")
+    with pytest.raises(ValueError, match=r"unknown preset '12' of quadrotor.*Valid: 9, 10"):
+        task_in_preset("quadrotor", "12")

@@ -14,6 +14,7 @@ import pytest
 from lagros_envs import Scenario, Task, find_task, register_task
 from lagros_envs.check_task import check_task
 from lagros_envs.registry import called, task_named, task_names
+from lagros_envs.task import Feedback
 from lagros_envs.tasks import SHIPPED
 
 FILE = Path(__file__).parent / "files" / "puck.py"
@@ -210,6 +211,10 @@ FAULTS = {
     "sign": ({"control_scale": (1.0, -1.0)}, r"control_scale\[1\]=-1.0 must be finite and > 0"),
     "order": ({"control_low": (4.0, 4.0)}, r"control_low\[0\]=4 must not be above control_high"),
     "place": ({"position": (0, 4)}, "position=.0, 4. must be different indices of states, 0 to 3"),
+    "axes": ({"position": (0,)}, "position=.0,. must be two or three"),
+    "space": ({"position": (0, 1, 2), "most_discs": 1}, "most_discs=1 needs position, the two"),
+    "picture": ({"place": lambda task, state: state}, "place.state. has shape .4,."),
+    "regulator": ({"regulator": Feedback((1.0,), (1.0,))}, "regulator.state_weights=.1.0,. must"),
     "flat": ({"position": ()}, "most_discs=3 needs position"),
     "room": ({"most_discs": 1}, "has 2 discs; an observation has room for most_discs=1"),
     "state": ({"state_high": (1.0,) * 4}, "is beyond state_high"),

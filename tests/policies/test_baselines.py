@@ -7,11 +7,12 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
 from lagros_envs.dynamics import hold_step
+from lagros_envs.registry import find_task
 from lagros_envs.tasks.cartpole.env import CartPoleEnv
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.cartpole.vector import CartPoleVectorEnv
 from lagros_policies.actor import PpoPolicy, SacPolicy, Td3Policy
-from lagros_policies.baselines import LqrPolicy, RandomPolicy
+from lagros_policies.baselines import LqrPolicy, RandomPolicy, regulator_weights
 from lagros_policies.residual import ResidualPolicy
 from lagros_policies.sb3_model import StableBaselines3Policy
 
@@ -146,3 +147,12 @@ def test_stable_baselines3_evaluates_every_policy(model):
         assert np.all(np.isfinite(rewards))
         if policy.name not in ("random", "model"):
             assert lengths == [90, 90]
+
+
+def test_a_regulator_of_the_goal_takes_weights_of_its_own_and_the_others_do_not():
+    task = find_task("quadrotor")
+    assert task.regulator != task.feedback == regulator_weights(task)
+    state, control = task.regulator.state_weights, task.regulator.control_weights
+    asked = LqrPolicy(task, state_weights=state, control_weights=control)
+    np.testing.assert_array_equal(LqrPolicy(task).gain, asked.gain)
+    assert not np.allclose(LqrPolicy(task, control_weights=0.03).gain, asked.gain)
