@@ -14,7 +14,7 @@ from lagros_benchmarks.run.single import SingleExperiment
 from lagros_benchmarks.run.suite import SuiteSettings, flyable
 from lagros_envs.registry import find_task
 
-SLIDE = str(Path(__file__).parent / "toys.py") + ":Slide"
+TOYS = Path(__file__).parent / "toys.py"
 POLICIES = "tube-mpc,lqr,sd-lqr,ppo"
 SUITE = ["--policies", POLICIES, "--episodes", "3", "--fewer", "lqr=2", "--proved", "1"]
 SUITE += ["--seed", "4", "--initial-error", "0.05"]
@@ -27,21 +27,29 @@ def invoke(*words: str):
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory):
+def slide(tmp_path_factory):
+    """A task in a file that lies alone: what lies beside it decides what a run is known by, too."""
+    place = tmp_path_factory.mktemp("task") / "toys.py"
+    place.write_bytes(TOYS.read_bytes())
+    return f"{place}:Slide"
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory, slide):
     """A suite of one task and its files."""
     out = tmp_path_factory.mktemp("suite")
-    invoke("suite", SLIDE, *SUITE, "--out", str(out))
+    invoke("suite", slide, *SUITE, "--out", str(out))
     return out, json.loads((out / "suite.json").read_text())
 
 
-def test_the_rows_are_those_of_the_benchmark(flown, tmp_path):
+def test_the_rows_are_those_of_the_benchmark(flown, slide, tmp_path):
     out, result = flown
     assert (out / "all.png").stat().st_size > 1000
     path = tmp_path / "rows.json"
     words = ["--policies", "tube-mpc,sd-lqr", "--episodes", "3", "--seed", "4"]
     words += ["--disturbance", "uniform,constant", "--bound", "0.1"]
     for error in ("0", "0.05"):
-        invoke("bench", SLIDE, *words, "--initial-error", error, "--json", str(path))
+        invoke("bench", slide, *words, "--initial-error", error, "--json", str(path))
         for row in json.loads(path.read_text()):
             (ours,) = (
                 one
@@ -92,14 +100,14 @@ def test_the_page_has_a_line_for_every_policy(flown):
     assert "not all of them flew slider" in text
 
 
-def test_it_goes_on_where_it_was_and_is_drawn_again_without_flying(flown, monkeypatch):
+def test_it_goes_on_where_it_was_and_is_drawn_again_without_flying(flown, slide, monkeypatch):
     out, result = flown
 
     def never(*_):
         raise AssertionError("it flies again")
 
     monkeypatch.setattr(SingleExperiment, "play", never)
-    invoke("suite", SLIDE, *SUITE, "--out", str(out))
+    invoke("suite", slide, *SUITE, "--out", str(out))
     again = json.loads((out / "suite.json").read_text())
     assert again["rows"] == result["rows"]
     (out / "all.md").unlink()
@@ -107,7 +115,7 @@ def test_it_goes_on_where_it_was_and_is_drawn_again_without_flying(flown, monkey
     assert (out / "all.md").read_text().startswith("# All systems, all policies\n\n    ")
     assert json.loads((out / "suite.json").read_text())["rows"] == result["rows"]
     # A task that is named takes the place of its rows, and the settings are those of the file.
-    invoke("suite", SLIDE, "--from", str(out / "suite.json"), "--out", str(out))
+    invoke("suite", slide, "--from", str(out / "suite.json"), "--out", str(out))
     merged = json.loads((out / "suite.json").read_text())
     assert merged["rows"] == result["rows"]
     assert merged["missing"] == result["missing"]
@@ -190,14 +198,14 @@ def _keys():
     return [(kind, beside) for kind in ("uniform", "constant") for beside in (0.0, 0.2)]
 
 
-def test_what_cannot_be_flown_is_refused_or_said_to_be_missing():
+def test_what_cannot_be_flown_is_refused_or_said_to_be_missing(slide):
     with pytest.raises(ValueError, match="unknown policy 'nonsense'"):
-        SuiteSettings(tasks=(SLIDE,), policies=("lqr", "nonsense"))
+        SuiteSettings(tasks=(slide,), policies=("lqr", "nonsense"))
     with pytest.raises(ValueError, match="names lqr twice"):
-        SuiteSettings(tasks=(SLIDE,), policies=("lqr", "lqr"))
+        SuiteSettings(tasks=(slide,), policies=("lqr", "lqr"))
     with pytest.raises(ValueError, match="fewer=mpc=7"):
-        SuiteSettings(tasks=(SLIDE,), episodes=6, fewer={"mpc": 7})
-    there, missing = flyable(find_task(SLIDE), ("lqr", "tube-mpc:least-norm"))
+        SuiteSettings(tasks=(slide,), episodes=6, fewer={"mpc": 7})
+    there, missing = flyable(find_task(slide), ("lqr", "tube-mpc:least-norm"))
     assert there == ("lqr",)
     assert missing[0].policy == "tube-mpc:least-norm"
     with pytest.raises(ValueError, match="needs a system of one body"):
