@@ -21,6 +21,7 @@ from typing import Any
 import lagros_benchmarks.__main__ as program
 from lagros_benchmarks.commands import cli
 from lagros_benchmarks.report import figures
+from lagros_benchmarks.report.page import assemble
 from lagros_benchmarks.run import demonstrations, files, runner
 from lagros_benchmarks.tasks.spacecraft import certify as spacecraft_certify
 from lagros_benchmarks.tasks.spacecraft import scene_figure
@@ -29,12 +30,12 @@ from lagros_benchmarks.training import curves
 from lagros_benchmarks.worst_case import attack
 from tests.benchmarks.tiny_training import TINY
 
-BENCH = "--json b.json --csv b.csv --latex b.tex --markdown b.md --figure b.png"
+BENCH = "--json b.json --csv b.csv --latex b.tex --markdown b.md --figure b.png --html b.html"
 # Each command in a small size, with the files that it writes.
 COMMANDS = {
     "bench": (
         f"bench cartpole --policies lqr,random --episodes 1 {BENCH} --episodes-file b.jsonl",
-        ("b.json", "b.csv", "b.tex", "b.md", "b.png", "b.jsonl"),
+        ("b.json", "b.csv", "b.tex", "b.md", "b.png", "b.html", "b.jsonl"),
     ),
     "spacecraft": (
         "bench spacecraft --policies learned --episodes 1 --agents 1 --bound 0.4 "
@@ -111,6 +112,7 @@ def make_small() -> None:
     attack.run_attack = once(attack.run_attack)
     spacecraft_certify.certify = once(spacecraft_certify.certify)
     demonstrations.demonstrate = once(demonstrations.demonstrate)
+    assemble.bench_page = once(assemble.bench_page)
     for module, name in ((figures, "draw"), (curves, "draw"), (scene_figure, "scene_figure")):
         setattr(module, name, drawn_once(getattr(module, name)))
 

@@ -29,6 +29,7 @@ from lagros_benchmarks.run.settings import BenchmarkSettings
 from lagros_envs.env import TaskEnv
 from lagros_envs.registry import task_named, task_names
 from tests.benchmarks import fakes, spacecraft_fakes
+from tests.found import SINGLE_BODY, named, task_of
 
 SINGLE = [name for name in task_names() if task_named(name).most_agents == 1]
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&amp;\"'"
@@ -398,7 +399,7 @@ def test_bench_writes_the_page_of_its_table(tmp_path, monkeypatch):
     ]
 
 
-@pytest.mark.parametrize("task", SINGLE)
+@pytest.mark.parametrize("task", named(SINGLE_BODY))
 def test_watch_writes_a_page_without_pygame(task, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "pygame", None)
@@ -410,7 +411,12 @@ def test_watch_writes_a_page_without_pygame(task, tmp_path, monkeypatch):
     assert not data["rows"]
     (flight,) = one["flights"].values()
     assert flight["text"] in result.stdout
-    assert unpacked(flight["times"])[-1] <= 2.0 + 1e-3
+    times, states = unpacked(flight["times"]), unpacked(flight["parts"]["states"])
+    assert times[-1] <= 2.0 + 1e-3
+    assert states.shape == (len(times), len(data["states"]))
+    # Who has no place is not drawn.
+    drawn = task_of(task).place(states[0]).size > 0
+    assert ("places" in flight["parts"]) == drawn
 
 
 def test_watch_opens_the_page_it_writes(tmp_path, monkeypatch):

@@ -166,7 +166,7 @@ function effortChart(rows) {
   const highest = Math.max(...all, 1e-9), least = Math.min(...all, highest);
   const log = highest > 12 * least;
   const x = { low: log ? 0.8 * least : 0, high: (log ? 1.25 : 1.08) * highest, log,
-    label: `mean effort [${DATA.effort}]` };
+    label: `mean effort${DATA.effort ? ` [${DATA.effort}]` : ""}` };
   const frame = axes(x, { ...PERCENT });
   for (const row of known) {
     const series = DATA.series[row.series], { effort_mean: effort, effort_ci95: spread } = row.figures;

@@ -250,7 +250,7 @@ function drawCurves(canvas, given, t, duration) {
   const flight = decode(given), { measures } = flight, lines = [];
   if (measures.error) lines.push([bodiesOf(flight) > 1 ? "largest ‖x − x_d‖" : "‖x − x_d‖", measures.error, [["tube", measures.tube], ["proved", measures.proved]]]);
   lines.push([bodiesOf(flight) > 1 ? "largest distance to a goal" : "distance to the goal", measures.distance, [["radius", measures.radius]]]);
-  const each = 74, [pen, width] = prepared(canvas, each * lines.length + 4), left = 40, right = 8;
+  const each = 74, [pen, width] = prepared(canvas, each * lines.length + 4), left = 50, right = 8;
   const across = (time) => left + ((width - left - right) * time) / (duration || 1);
   lines.forEach(([name, values, bounds], line) => {
     const top = each * line + 20, bottom = each * (line + 1) - 4;

@@ -31,6 +31,7 @@ function makeTable() {
     const found = /[−-]?\d+(\.\d+)?(e[+−-]?\d+)?/.exec(cell);
     return found ? Number(found[0].replaceAll("−", "-")) - (cell[0] === "<" ? 1e-9 : 0) : cell;
   };
+  const kindOf = (index) => [isText(index) ? "text" : "", index > 0 && index <= own.length ? "where" : ""].join(" ").trim();
   const isText = (index) => index === 0 || columns[index][0] === "disturbance";
   const compare = (index, a, b) => {
     if (isText(index)) return a.localeCompare(b);
@@ -47,7 +48,7 @@ function makeTable() {
         || (down ? -1 : 1) * compare(index, a.cells[index], b.cells[index]));
     }
     body.replaceChildren(...rows.map(({ row, cells }) => el("tr", {}, ...cells.map((cell, index) =>
-      el("td", { class: isText(index) ? "text" : null },
+      el("td", { class: kindOf(index) || null },
         index === 0 ? swatch(DATA.series[row.series]) : null, cell)))));
     [...head.rows[0].cells].forEach((cell, index) => cell.setAttribute("aria-sort",
       sorted && sorted.index === index ? (sorted.down ? "descending" : "ascending") : "none"));
@@ -61,11 +62,12 @@ function makeTable() {
   }
 
   head.append(el("tr", {}, ...columns.map(([heading, unit], index) =>
-    el("th", { scope: "col", class: isText(index) ? "text" : null },
+    el("th", { scope: "col", class: kindOf(index) || null },
       el("button", { type: "button", onclick: () => sort(index) },
         el("span", {}, heading), el("small", {}, unit))))));
   byId("legend").textContent = DATA.legend || "";
   return (condition) => {
+    byId("table").classList.toggle("one", condition != null);
     shown = DATA.rows.filter((row) => condition == null || row.condition === condition);
     draw();
     const said = condition == null ? [] : DATA.conditions[condition].lines;
