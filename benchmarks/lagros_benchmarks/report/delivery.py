@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -129,7 +130,9 @@ class Outputs:
         )
         delivery.write(self.figure, lambda path: figures.draw(rows, path))
         delivery.write(self.scene, lambda path: _draw_scene(run, self.scene_world, path))
-        delivery.write(self.html, lambda path: _write_page(run, rows, path, progress))
+        # Once, also where it is kept elsewhere: its episodes are flown for it.
+        page = cache(lambda: _page(run, rows, progress))
+        delivery.write(self.html, lambda path: files.write_atomic(path, page()))
         return delivery
 
 
@@ -139,15 +142,11 @@ def _draw_scene(run: BenchmarkRun, world: int, path: Path) -> None:
         room_of(run.settings.description).part("scene")(run.settings, world, path)
 
 
-def _write_page(
-    run: BenchmarkRun, rows: Sequence[Row], path: Path, progress: Progress | None
-) -> None:
+def _page(run: BenchmarkRun, rows: Sequence[Row], progress: Progress | None) -> str:
     from lagros_benchmarks.report.page.assemble import bench_page
-    from lagros_benchmarks.run.files import write_atomic
 
     with redirect_stdout(sys.stderr), undone():
-        page = bench_page(run, rows, progress)
-    write_atomic(path, page)
+        return bench_page(run, rows, progress)
 
 
 def print_report(rows: Sequence[Row], console: Console | None = None) -> None:
