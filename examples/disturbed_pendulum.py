@@ -2,7 +2,7 @@
 
     python examples/disturbed_pendulum.py runs/pendulum
     lagros bench gym:Pendulum-v1 --policies runs/pendulum/calm.zip,runs/pendulum/disturbed.zip \
-        --disturbance uniform,constant,switching --bound 1 --episodes 100
+        --disturbance none,uniform,constant,switching --bound 1 --episodes 50
     lagros attack gym:Pendulum-v1 --policy runs/pendulum/calm.zip --bound 1
 
 Needs stable-baselines3 (`pip install "lagros[rl]"`), and some minutes. Settings of PPO as in

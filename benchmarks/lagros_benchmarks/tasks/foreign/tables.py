@@ -80,7 +80,8 @@ def comparison_lines(group: Sequence[Row]) -> Iterator[str]:
         versus, name = row["versus"][first], f"{policy_label(row['policy']):<{LONGEST_LABEL}}"
         interval = versus["return_difference_ci95"]
         between = "" if interval is None else f" ({number(interval[0])} to {number(interval[1])})"
-        yield f"  {name} return {number(versus['return_difference'])} more{between}"
+        gain = number(versus["return_difference"])
+        yield f"  {name} return {gain if gain.startswith(('-', '–')) else f'+{gain}'}{between}"
 
 
 def markdown_grids(groups: Sequence[Sequence[Row]]) -> list[str]:
