@@ -185,6 +185,10 @@ class Task(Described):
         learning: How its networks are made; None for none.
         weights: Folder of its metric and networks; None for that of its `lagros reproduce`,
             `runs/reproduce-NAME` from the working directory.
+        keep: What plans keep at or below zero at their control instants besides all bounds, such as
+            a speed minus its limit, a method of state and functions that returns several numbers;
+            one counts as much as one `state_scale`. Written like an equation of motion, with a
+            slope wherever a plan may come to. None for nothing.
         features: What its networks see, a method of an observation's components and the functions
             that they may use, written like an equation of motion; None for the usual.
     """
@@ -211,6 +215,7 @@ class Task(Described):
     regulator: ClassVar[Feedback | None] = None
     learning: ClassVar[Learning | None] = None
     weights: ClassVar[Path | None] = None
+    keep: ClassVar[Callable[..., Sequence[Any]] | None] = None
     features: ClassVar[Callable[..., Sequence[Any]] | None] = None
     # Without an annotation: a task may make fields of them.
     alive_bonus = 10.0

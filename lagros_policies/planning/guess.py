@@ -130,4 +130,4 @@ def _pace(problem: Problem, path: FloatArray, share: FloatArray) -> FloatArray:
 
 
 def _violation(plan: Trajectory) -> float:
-    return max(plan.defect, -plan.clearance)
+    return max(plan.defect, -plan.clearance, plan.excess)

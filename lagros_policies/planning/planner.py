@@ -92,6 +92,7 @@ def problem_of(
         state_scale=_filled(task.state_scale, n, 1.0),
         control_scale=_filled(task.control_spread, m, 1.0),
         discs=_discs(task, scenario.discs, start, goal, steps_left(task, first_step)),
+        keep=task.keep,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -25,6 +26,9 @@ from lagros_policies.contraction.tube import tighten
 # By so much less than required a distance from a disc counts as kept [units of the position].
 DISTANCE_SLACK = 1e-6
 
+
+# (components of states, functions) -> numbers that are to stay at or below zero.
+Keep = Callable[[Sequence[Any], Any], Sequence[Any]]
 
 # One number for all entries of an array.
 _NO_LOW, _NO_HIGH = partial(np.array, -np.inf), partial(np.array, np.inf)
@@ -84,7 +88,8 @@ class Problem:
 
         min  sum_k ||u_k - u_ref||^2 period
         s.t. x_{k+1} = F(x_k, u_k), x_0 and x_N given, low <= x_k <= high for k = 1 ... N,
-             low <= u_k <= high, and ||p(t) - o_j|| >= R_j(t) at the nodes and between them
+             low <= u_k <= high, ||p(t) - o_j|| >= R_j(t) at the nodes and between them,
+             and g(x_k) <= 0 for k = 1 ... N
 
     Bounds and scales may be given as one number for all, or without the axis of time.
 
@@ -104,6 +109,8 @@ class Problem:
             fast motion is drowned.
         control_scale: Likewise for the controls, shape (m,).
         discs: What the position must stay clear of.
+        keep: g, numbers that stay at or below zero; one of them counts as much as one scale. No
+            tube tightens them: they bring their own room.
 
     Raises:
         ValueError: A shape is wrong, a number is not finite where it must be, bounds cross, the end
@@ -123,6 +130,7 @@ class Problem:
     state_scale: FloatArray = field(default_factory=_ONE)
     control_scale: FloatArray = field(default_factory=_ONE)
     discs: Discs | None = None
+    keep: Keep | None = None
 
     def __post_init__(self) -> None:
         """Take the numbers in double precision, fill the shapes and check them."""

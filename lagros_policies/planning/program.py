@@ -1,6 +1,6 @@
-"""One quadratic program of the planner of one body: unknowns, linearised dynamics, half-planes.
+"""One quadratic program of the planner of one body: unknowns, linearised dynamics, half-spaces.
 
-The unknowns are u_0, x_1, u_1, x_2, ... in units of the problem's scales, and two per half-plane:
+The unknowns are u_0, x_1, u_1, x_2, ... in units of the problem's scales, and two per half-space:
 by how much it is violated and by how much it is kept.
 """
 
@@ -9,11 +9,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
 from lagros_envs.arrays import FloatArray, IntArray
+from lagros_envs.dynamics.system import components
+from lagros_envs.numbers import dual
+from lagros_envs.numbers import functions as elementary
 from lagros_policies.planning.problem import Problem
 from lagros_policies.planning.qp import UNBOUNDED, QuadraticProgram
 from lagros_policies.planning.vectors import unit_vectors
@@ -48,6 +52,7 @@ class Point:
         following: F(x_k, u_k), shape (N, n).
         required: Distances that the nodes must keep, shape (N + 1, k), or None without discs.
         clearance: Least distance beyond what the problem requires.
+        excess: Largest of what the problem keeps at or below zero.
         merit: Effort plus the weighted violations.
     """
 
@@ -56,12 +61,27 @@ class Point:
     following: FloatArray
     required: FloatArray | None = None
     clearance: float = math.inf
+    excess: float = -math.inf
     merit: float = math.inf
 
     @property
     def defect(self) -> float:
         """Largest violation of the dynamics."""
         return float(np.max(np.abs(self.following - self.states[1:])))
+
+
+class HalfSpaces(NamedTuple):
+    """Conditions slope'x_k >= bound on states in scales.
+
+    Attributes:
+        node: k of each, shape (r,).
+        slope: Shape (r, n).
+        bound: Shape (r,).
+    """
+
+    node: IntArray
+    slope: FloatArray
+    bound: FloatArray
 
 
 @lru_cache(maxsize=256)
@@ -94,14 +114,15 @@ class Programs:
 
     Args:
         problem: What to plan.
-        penalty: Weight of a violated half-plane, in units of the scale of the position.
-        reach: A half-plane is imposed where a trajectory is nearer than the required distance plus
-            this many scales of the position.
+        penalty: Weight of a violated half-space, in scales.
+        reach: A half-space is imposed where a trajectory is nearer to its border, with all that is
+            required, than so many scales.
+        spare: How much more than zero is asked of what the problem keeps at or below it.
     """
 
-    def __init__(self, problem: Problem, penalty: float, reach: float) -> None:
+    def __init__(self, problem: Problem, penalty: float, reach: float, spare: float = 0.0) -> None:
         """Compute what no pass changes."""
-        self.problem, self.penalty, self.reach = problem, penalty, reach
+        self.problem, self.penalty, self.reach, self.spare = problem, penalty, reach, spare
         n, m, steps = problem.system.state_dim, problem.system.control_dim, problem.steps
         self.place = place = layout(steps, n, m)
         self._shape = steps * n, steps * (n + m)
@@ -157,10 +178,25 @@ class Programs:
         # The trajectory ends where the problem does, to within the solvers' tolerance.
         low[self._end] = high[self._end] = states[-1][self._given]
         program = QuadraticProgram(diagonal, linear, equality, target.ravel(), low, high)
-        return program if point.required is None else self._with_discs(program, point)
+        found = [] if point.required is None else [self._beside_discs(point)]
+        found += [] if self.problem.keep is None else [self._kept(point)]
+        parts = [np.concatenate(part) for part in zip(*found, strict=True)]
+        return self._within(program, HalfSpaces(*parts)) if parts else program
 
-    def _with_discs(self, program: QuadraticProgram, point: Point) -> QuadraticProgram:
-        """Add n'p_k + violated - kept = R + n'o for the discs near each node."""
+    def _kept(self, point: Point) -> HalfSpaces:
+        """Return g + (dg/dx)'(x - x_k) <= 0 for what the problem keeps, where it is near zero."""
+        problem, states = self.problem, point.states[1:]
+        assert problem.keep is not None
+        numbers = list(problem.keep(dual.seed(components(states)), elementary))
+        slopes = dual.gradients(numbers, states.shape[1], states.shape[:1])
+        values = np.stack([number.value for number in numbers], axis=-1) + self.spare
+        node, which = np.nonzero(values > -self.reach)
+        slope = slopes[node, which]
+        bound = values[node, which] - np.einsum("ri,ri->r", slope, states[node])
+        return HalfSpaces(node + 1, -slope * problem.state_scale, bound)
+
+    def _beside_discs(self, point: Point) -> HalfSpaces:
+        """Return n'p_k >= R + n'o for the discs near each node."""
         problem, required = self.problem, point.required
         assert problem.discs is not None
         assert required is not None
@@ -174,22 +210,24 @@ class Programs:
         if np.all(self._given[axes]):
             near[-1] = False
         node, disc = np.nonzero(near)
-        count = node.size
         normal = unit_vectors(delta[node, disc], distance[node, disc])
         offset = required[node, disc] + np.sum(normal * centres[disc], axis=-1)
+        slope = np.zeros((node.size, problem.system.state_dim))
+        slope[:, axes] = normal * problem.state_scale[axes] / scale
+        return HalfSpaces(node, slope, offset / scale)
+
+    def _within(self, program: QuadraticProgram, spaces: HalfSpaces) -> QuadraticProgram:
+        """Add slope'x_k + violated - kept = bound for each half-space."""
+        count, size = spaces.node.size, program.cost_diagonal.size
         one, row = np.ones(count), np.arange(count)
-        size = program.cost_diagonal.size
+        which, coordinate = np.nonzero(spaces.slope)
+        places = self.place.states[spaces.node[which] - 1, coordinate]
         planes = sparse.csc_matrix(
             (
-                np.concatenate([(normal * problem.state_scale[axes] / scale).T.ravel(), one, -one]),
+                np.concatenate([spaces.slope[which, coordinate], one, -one]),
                 (
-                    np.concatenate([row, row, row, row]),
-                    np.concatenate(
-                        [
-                            self.place.states[node - 1][:, axes].T.ravel(),
-                            size + np.arange(2 * count),
-                        ]
-                    ),
+                    np.concatenate([which, row, row]),
+                    np.concatenate([places, size + np.arange(2 * count)]),
                 ),
             ),
             shape=(count, size + 2 * count),
@@ -204,7 +242,7 @@ class Programs:
             np.concatenate([program.cost_diagonal, np.zeros(2 * count)]),
             np.concatenate([program.cost_linear, self.penalty * one, 0.0 * one]),
             sparse.vstack([wide, planes], format="csc"),
-            np.concatenate([program.target, offset / scale]),
+            np.concatenate([program.target, spaces.bound]),
             np.concatenate([program.low, np.zeros(2 * count)]),
             np.concatenate([program.high, np.full(2 * count, UNBOUNDED)]),
         )

@@ -1,12 +1,12 @@
 """Sequential convex programming with a trust region for least-effort trajectories.
 
 The problem is the paper's (19): min of the integral of ||u - u_ref||^2 subject to the dynamics, a
-given initial state, a given terminal state, bounds on states and controls, and distances from
-discs; see `problem`. Each pass linearises the held Runge-Kutta dynamics and the distances, solves
-one sparse quadratic program, and accepts the step if it lowers an exact penalty of the true
-problem. The defects are those of the true dynamics at every pass; the slopes come from a coarser
-Runge-Kutta step, which moves the limit by far less than the tolerance on effort and halves the cost
-of a pass.
+given initial state, a given terminal state, bounds on states and controls, distances from discs,
+and whatever else a task keeps at or below zero; see `problem`. Each pass linearises the held
+Runge-Kutta dynamics, the distances and what is kept, solves one sparse quadratic program, and
+accepts the step if it lowers an exact penalty of the true problem. The defects are those of the
+true dynamics at every pass; the slopes come from a coarser Runge-Kutta step, which moves the limit
+by far less than the tolerance on effort and halves the cost of a pass.
 
 A disc is imposed at the nodes, as the half-plane beside it that the last trajectory points at. By
 as much as the trajectory comes nearer between two nodes than it is at them, both must keep more.
@@ -23,6 +23,8 @@ from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_above, check_fields, check_not_negative
 from lagros_envs.dynamics import hold_step, linearise_hold
 from lagros_envs.dynamics.integrate import SUBSTEPS
+from lagros_envs.dynamics.system import components
+from lagros_envs.numbers import functions
 from lagros_policies.planning.problem import DISTANCE_SLACK, Problem
 from lagros_policies.planning.program import Point, Programs
 from lagros_policies.planning.qp import QpSolver, solve_qp
@@ -53,8 +55,9 @@ class ScpSettings:
             accepted at the second attempt or later.
         penalty: Weight of violations, in scales, in the merit function.
         slope_substeps: Runge-Kutta substeps behind the slopes.
-        disc_reach: Discs are imposed at nodes nearer than required plus this many scales.
-        disc_spare: How much more than required is asked for at the nodes, in scales.
+        disc_reach: Discs are imposed at nodes nearer than required plus this many scales, and what
+            is kept at or below zero where it is above minus this.
+        disc_spare: How much more than required is asked for at the nodes, in scales, of both.
         qp_solver: Which solver is asked first.
 
     Raises:
@@ -112,7 +115,9 @@ class _Iteration:
 
     def __init__(self, problem: Problem, settings: ScpSettings) -> None:
         self.problem, self.settings = problem, settings
-        self.programs = Programs(problem, settings.penalty, settings.disc_reach)
+        self.programs = Programs(
+            problem, settings.penalty, settings.disc_reach, settings.disc_spare
+        )
         self.bounded = (
             problem.control_low.max() > -math.inf or problem.control_high.min() < math.inf
         )
@@ -162,6 +167,7 @@ class _Iteration:
                 at_rest
                 and point.defect <= settings.defect_tolerance
                 and point.clearance >= -DISTANCE_SLACK
+                and point.excess <= DISTANCE_SLACK
             ):
                 solved, status = True, "solved"
                 break
@@ -175,6 +181,7 @@ class _Iteration:
             point.defect,
             iterations,
             point.clearance,
+            point.excess,
             problem.reference_control,
         )
 
@@ -254,10 +261,15 @@ class _Iteration:
             # A guess may exceed the bounds of the controls; no program does.
             beyond = np.maximum(problem.control_low - controls, controls - problem.control_high)
             violation += (np.maximum(beyond, 0.0) / problem.control_scale).sum()
+        excess = -math.inf
+        if problem.keep is not None:
+            kept = np.stack([*problem.keep(components(later), functions)], axis=-1)
+            excess = float(np.max(kept))
+            short += float(np.maximum(kept + self.settings.disc_spare, 0.0).sum())
         effort = ((controls - problem.reference_control) ** 2).sum() * problem.period
         effort /= problem.control_scale.max() ** 2
         merit = float(effort + self.settings.penalty * (violation + short))
-        return Point(states, controls, following, required, clearance, merit)
+        return Point(states, controls, following, required, clearance, excess, merit)
 
     def _flow(self, states: FloatArray, controls: FloatArray) -> list[FloatArray]:
         """Return x_k, and the states after each Runge-Kutta step of its hold, each (N, n)."""

@@ -24,6 +24,7 @@ class Trajectory:
         iterations: Convex programs solved.
         clearance: Least distance from a disc beyond the required one, between the instants too;
             inf where there is no disc.
+        excess: Largest of the numbers that the problem keeps at or below zero; -inf without any.
         reference_control: u_ref, from which effort is counted, shape (m,); zero if left out.
     """
 
@@ -35,6 +36,7 @@ class Trajectory:
     defect: float
     iterations: int
     clearance: float = math.inf
+    excess: float = -math.inf
     reference_control: FloatArray | None = None
 
     @property
