@@ -36,6 +36,7 @@ SHIPPED = {
         "lagros_envs.tasks.spacecraft.single:SpacecraftEnv",
         "lagros_envs.tasks.spacecraft.vector:SpacecraftVectorEnv",
     ),
+    "docking": Shipped("lagros_envs.tasks.docking.task:DockingSettings", "Docking", 120),
     "segway": Shipped("lagros_envs.tasks.segway.task:SegwaySettings", "Segway", 60),
     "pvtol": Shipped("lagros_envs.tasks.pvtol.task:PvtolSettings", "Pvtol", 60),
     "car": Shipped("lagros_envs.tasks.car.task:CarSettings", "Car", 60),

@@ -1,0 +1,1 @@
+"""Docking: a chaser that approaches a target on a circular orbit."""
