@@ -19,7 +19,8 @@ the median one; how often a projection moves the control; for how many plans a t
 The weights that the cart-pole ships were found on other episodes by benchmarks/tuning/plan_law.py.
 
     OMP_NUM_THREADS=1 python benchmarks/studies/plan_law.py [--task cartpole] [--episodes 200]
-        [--proved 20] [--only NAME,...] [--json benchmarks/results/plan_law.json] [--figure FILE]
+        [--proved 20] [--only NAME,...] [--period 0.05] [--share 1.5]
+        [--json benchmarks/results/plan_law.json] [--figure FILE]
 
 With --only, the other rows of the JSON file stay as they are.
 """
@@ -196,10 +197,11 @@ def proved_share(expert: Expert, episodes: Episodes, count: int, bound: float) -
     return float(np.mean(tubes.closed))
 
 
-def study(task: Task, names: Sequence[str], count: int, proved: int) -> list[dict[str, Any]]:
+def study(task: Task, names: Sequence[str], options: argparse.Namespace) -> list[dict[str, Any]]:
     """Fly what is compared and return a row for each; what cannot be built has none."""
     rows: list[dict[str, Any]] = []
-    bound, build = task.defaults.bound, laws(task)
+    count, proved = options.episodes, options.proved
+    bound, build = options.share * task.defaults.bound, laws(task)
     episodes = draw_episodes(Expert(task), episode_seeds(0, count, _NAMESPACE))
     for name in names:
         try:
@@ -305,17 +307,21 @@ def main() -> None:
     parser.add_argument("--task", default="cartpole")
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--proved", type=int, default=20, help="plans whose tubes are asked for")
+    parser.add_argument("--period", type=float, help="another control period [s]")
+    parser.add_argument("--share", type=float, default=1.0, help="of the bound of the task")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--figure", type=Path)
     parser.add_argument("--only", help="names of rows, such as gain,lqr")
     options = parser.parse_args()
     task: Any = find_task(options.task)
+    if options.period is not None:
+        task = replace(task, control_period=options.period)
     names = list(laws(task))
     found = {}
     if options.only and options.json and options.json.is_file():
         found = {row["law"]: row for row in json.loads(options.json.read_text())}
     asked = options.only.split(",") if options.only else names
-    found |= {row["law"]: row for row in study(task, asked, options.episodes, options.proved)}
+    found |= {row["law"]: row for row in study(task, asked, options)}
     rows = [found[name] for name in names if name in found]
     show(rows)
     if options.json:
