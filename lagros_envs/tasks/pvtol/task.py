@@ -49,7 +49,7 @@ class PvtolSettings(Task):
     position = (0, 1)
     body_radius = 0.2
     most_discs = 5
-    margin = 0.25
+    margin = 0.35
     metric = MetricDesign(
         low=(-5.0, -5.0, -_TILT, -2.0, -1.0, -_TILT),
         high=(10.0, 5.0, _TILT, 2.0, 1.0, _TILT),
@@ -60,19 +60,20 @@ class PvtolSettings(Task):
         scaling=(1.0, 1.0, 3.0, 1.0, 1.0, 1.0),
     )
     # R by benchmarks/studies/plan_law.py --task pvtol: no kind of disturbance costs an episode.
-    feedback = Feedback((1.0, 1.0, 0.3, 0.3, 0.3, 0.03), (0.6, 0.6))
+    feedback = Feedback((1.0, 1.0, 0.3, 0.3, 0.3, 0.03), (0.2, 0.2), rate=1.0)
     learning = Learning(
-        plans=3000,
-        samples=180_000,
-        disturbance_bound=0.3,
+        plans=2400,
+        samples=168_000,
+        disturbance_bound=0.45,
         hidden=(64, 64, 128, 128),
-        epochs=14,
-        learned_epochs=12,
-        batch=256,
-        rounds=4,
-        round_plans=2500,
+        epochs=25,
+        learned_epochs=30,
+        batch=512,
+        rounds=6,
+        round_plans=2400,
         round_samples=60_000,
-        round_epochs=18,
+        round_epochs=15,
+        keeps_plan=True,
         mpc_samples=0,
     )
     defaults = Defaults(bounds=(0.3,), bound=0.3)
