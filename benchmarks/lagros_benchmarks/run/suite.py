@@ -173,7 +173,9 @@ def flyable(task: Task, policies: tuple[str, ...]) -> tuple[tuple[str, ...], lis
         try:
             built_policy(name, partial(make_policy, name, env, {}))
         except SetupError as error:
-            missing.append(Missing(task.name, name, str(error)))
+            # Without the folder of this machine, in which they would be.
+            absent = isinstance(error.__cause__, FileNotFoundError)
+            missing.append(Missing(task.name, name, "not trained" if absent else str(error)))
         else:
             there.append(name)
     return tuple(there), missing
