@@ -37,6 +37,7 @@ _SINGLE = {
     "lqr": "lagros_policies.baselines:LqrPolicy",
     "sd-lqr": "lagros_policies.sd_lqr:SdLqrPolicy",
     "random": "lagros_policies.baselines:RandomPolicy",
+    "c3m": "lagros_policies.c3m:C3mPolicy",
     "ppo": "lagros_policies.actor:PpoPolicy",
     "sac": "lagros_policies.actor:SacPolicy",
     "td3": "lagros_policies.actor:Td3Policy",

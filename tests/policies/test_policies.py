@@ -153,7 +153,10 @@ PLANNED = {
         ("clarabel", PLANNED),
         ("piqp", PLANNED),
         ("scipy", {"lqr", *PLANNED}),
-        ("safetensors", {"learned", "learned-mpc", "lagros", "ppo", "sac", "td3", "residual"}),
+        (
+            "safetensors",
+            {"learned", "learned-mpc", "lagros", "c3m", "ppo", "sac", "td3", "residual"},
+        ),
         ("torch", set()),
         ("cvxpy", set()),
         ("joblib", set()),

@@ -1,4 +1,4 @@
-"""`lagros train`: reinforcement learning of our tasks with stable-baselines3."""
+"""`lagros train`: the baselines that learn, by stable-baselines3 and by C3M."""
 
 from __future__ import annotations
 
@@ -14,11 +14,16 @@ import typer
 from lagros_benchmarks.commands.extras import check_extra
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs
 from lagros_benchmarks.commands.terminal import fail, file_option, interrupted, listed
+from lagros_envs.files import write_atomic
 
 if TYPE_CHECKING:
+    from lagros_benchmarks.training.c3m_run import C3mRun
     from lagros_benchmarks.training.settings import Training
+    from lagros_envs.task import Described
 
 RUNS = Path("runs/train")
+_C3M, _MISSING = "c3m", "missing"
+_FILLED = _C3M, "ppo", "sac"
 # Files of a run, see `training.run.Place`.
 KEPT = ("record.json", "weights.safetensors", "checkpoint.pt")
 
@@ -27,7 +32,11 @@ def train(
     task: Annotated[str, typer.Argument(help="As for `lagros bench`.")],
     algo: Annotated[
         str,
-        typer.Option(metavar="NAME[,NAME]", help="One body: of ppo, sac, td3. Many agents: ppo."),
+        typer.Option(
+            metavar="NAME[,NAME]",
+            help="One body: of ppo, sac, td3, c3m; or missing: those of c3m, ppo and sac that the "
+            "task has no weights of, which are put where its policies look. Many agents: ppo.",
+        ),
     ] = "ppo",
     seed: Annotated[
         str, typer.Option(metavar="N[,N]", help="Seeds; their episodes never occur in evaluation.")
@@ -58,8 +67,8 @@ def train(
     json: Annotated[Path | None, file_option("The learning curves of all runs.")] = None,
     figure: Annotated[Path | None, file_option("The same, drawn.")] = None,
 ) -> None:
-    """Train agents, one after the other; go on where a run was killed, skip what is complete."""
-    from lagros_benchmarks.training.course import course_of, default_training
+    """Train baselines, one after the other; go on where a run was killed, skip what is complete."""
+    from lagros_benchmarks.training.course import course_of
     from lagros_envs.registry import find_task
 
     try:
@@ -76,14 +85,22 @@ def train(
             raise ValueError(f"--parallel-env is for many agents; leave it out for {task}")
         if residual is not None and many:
             raise ValueError(f"--residual is for one body; leave it out for {task}")
+        fill = names == (_MISSING,)
+        if fill:
+            if many or len(seeds) > 1:
+                raise ValueError(f"--algo {_MISSING} is for one body and one seed")
+            names = tuple(name for name in _FILLED if not _shipped(described, name).is_file())
+        if many and _C3M in names:
+            raise ValueError(f"--algo {_C3M} is for one body")
+        learned = {"--segments": segments, "--residual": residual, "--json": json}
+        learned |= {"--figure": figure, "--tensorboard": tensorboard or None}
+        for option, value in learned.items():
+            if value is not None and _C3M in names:
+                raise ValueError(f"{option} is for reinforcement learning; leave it out for {_C3M}")
         changes: dict[str, Any] = {} if segments is None else {"segments": segments}
         if residual is not None:
             changes["largest_correction"] = residual
-        runs = [
-            replace(default_training(described.name, name), seed=number, **changes)
-            for number in seeds
-            for name in names
-        ]
+        runs = [_run(described.name, name, number, changes) for number in seeds for name in names]
         if figure is not None:
             from lagros_benchmarks.report.canvas import check_figure_path
 
@@ -97,7 +114,8 @@ def train(
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(message)s")
     try:
         records = [
-            _train_one(run, out, segments, residual, tensorboard, parallel_env) for run in runs
+            _train_one(run, out, segments, residual, tensorboard, parallel_env, fill)
+            for run in runs
         ]
     except (ImportError, ValueError, OSError) as error:
         # An extra that is not installed, a folder of another run, a full disk.
@@ -107,37 +125,61 @@ def train(
     _write_curves(records, json, figure).tell()
 
 
-def folder_of(run: Training, out: Path) -> Path:
+def _run(task: str, name: str, seed: int, changes: dict[str, Any]) -> Training | C3mRun:
+    from lagros_benchmarks.training.course import default_training
+
+    if name != _C3M:
+        return replace(default_training(task, name), seed=seed, **changes)
+    from lagros_benchmarks.training.c3m_run import C3mRun
+
+    return C3mRun(task).seeded(seed)
+
+
+def _shipped(task: Described, name: str) -> Path:
+    from lagros_policies.room import shipped_file
+
+    return shipped_file(task, f"{name}.safetensors")
+
+
+def folder_of(run: Training | C3mRun, out: Path) -> Path:
     """Return the folder of a run."""
     return out / f"{run.task}-{run.label}" / f"seed-{run.seed}"
 
 
 def _train_one(
-    run: Training,
+    run: Training | C3mRun,
     out: Path,
     segments: int | None,
     residual: float | None,
     tensorboard: bool,
     parallel_env: bool,
+    fill: bool,
 ) -> dict[str, Any]:
     check_extra("lagros train", "rl", "stable_baselines3")
     import torch
     from rich.console import Console
 
+    from lagros_benchmarks.training import c3m
+    from lagros_benchmarks.training.c3m_run import C3mRun
     from lagros_benchmarks.training.course import lesson_of
     from lagros_benchmarks.training.run import Place
     from lagros_benchmarks.training.run import train as train_run
     from lagros_benchmarks.training.table import final_table
     from lagros_envs.registry import find_task
-    from lagros_policies.room import shipped_file
 
     # One thread: networks this small gain nothing from more, and the sums stay reproducible.
     torch.set_num_threads(1)
     place = Place(folder_of(run, out), tensorboard)
-    command = f"lagros train {run.task} --algo {run.algorithm.name} --seed {run.seed}"
-    command += "" if segments is None else f" --segments {segments}"
-    command += "" if residual is None else f" --residual {residual:g}"
-    record = train_run(run, place, lambda: lesson_of(run, parallel_env), command)
+    if isinstance(run, C3mRun):
+        command = f"lagros train {run.task} --algo {run.label} --seed {run.seed}"
+        record = c3m.train(run, place, command)
+        name = run.label
+    else:
+        command = f"lagros train {run.task} --algo {run.algorithm.name} --seed {run.seed}"
+        command += "" if segments is None else f" --segments {segments}"
+        command += "" if residual is None else f" --residual {residual:g}"
+        record = train_run(run, place, lambda: lesson_of(run, parallel_env), command)
+        name = run.algorithm.name if residual is None else "residual"
     try:
         table = final_table(record)
     except (KeyError, TypeError, ValueError) as error:
@@ -146,9 +188,14 @@ def _train_one(
         ) from error
     typer.echo(f"{place.weights}, on held-out episodes:")
     Console(highlight=False).print(table)
-    name = run.algorithm.name if residual is None else "residual"
-    home = shipped_file(find_task(run.task), f"{name}.safetensors")
-    typer.echo(f"copy them to {home}, and they fly as the policy {name!r}")
+    home = _shipped(find_task(run.task), name)
+    if fill:
+        home.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(home, place.weights.read_bytes())
+        write_atomic(home.with_suffix(".json"), place.record.read_bytes())
+        typer.echo(f"copied to {home}: they fly as the policy {name!r}")
+    else:
+        typer.echo(f"copy them to {home}, and they fly as the policy {name!r}")
     return record
 
 

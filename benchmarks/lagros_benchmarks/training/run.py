@@ -143,7 +143,7 @@ def train(
     model.logger.close()
     made.save(model, place.weights)
     record = plain(_record(settings, curve, made.final(model), command))
-    record["weights_sha256"] = _digest(place.weights)
+    record["weights_sha256"] = digest_of(place.weights)
     write_json(place.record, record)
     place.checkpoint.unlink(missing_ok=True)
     finished: dict[str, Any] = record
@@ -158,7 +158,7 @@ def _complete(place: Place, settings: Any) -> dict[str, Any] | None:
         stored = found.record("training").entries
     except ValueError as error:
         raise ValueError(f"{error}; {damaged}") from error
-    _check_same(place.folder, stored, settings)
+    check_same(place.folder, stored, settings)
     try:
         _check_figures(found, settings["segments"])
     except ValueError as error:
@@ -167,7 +167,7 @@ def _complete(place: Place, settings: Any) -> dict[str, Any] | None:
     try:
         read_safetensors(place.weights)
         # Records of earlier versions have no hash; the file itself has a checksum.
-        if record.get("weights_sha256") not in (None, _digest(place.weights)):
+        if record.get("weights_sha256") not in (None, digest_of(place.weights)):
             raise ValueError(f"{place.weights} is not what this run has written")
     except (ValueError, OSError) as error:
         _LOG.warning("%s; the run is made again", error)
@@ -194,11 +194,17 @@ def _check_figures(found: Record, segments: int) -> None:
         Record(figures, f"{found.name}: 'final' {index}")
 
 
-def _digest(path: Path) -> str:
+def digest_of(path: Path) -> str:
+    """Return the hash of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _check_same(folder: Path, stored: Any, settings: Any) -> None:
+def check_same(folder: Path, stored: Any, settings: Any) -> None:
+    """Check that a folder holds the run that was asked for.
+
+    Raises:
+        ValueError: It holds another.
+    """
     if stored != settings:
         raise ValueError(
             f"{folder} holds another run ({_differences(stored, settings)}); delete it, or name "
@@ -318,7 +324,7 @@ def _restore(path: Path, settings: Any, model: BaseAlgorithm) -> list[dict[str, 
         stored = json.loads(content["training"])
     except Exception as error:
         raise _damaged(path, error) from error
-    _check_same(path.parent, stored, settings)
+    check_same(path.parent, stored, settings)
     try:
         model.set_parameters(content["parameters"])
         for name, value in _variables(model).items():

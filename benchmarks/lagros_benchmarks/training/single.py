@@ -17,10 +17,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from lagros_benchmarks.run.closed_loop import ClosedLoop
-from lagros_benchmarks.run.metrics import wilson_interval
 from lagros_benchmarks.training.agent import actor_network
-from lagros_benchmarks.training.run import rounded
+from lagros_benchmarks.training.evaluation import evaluate, final_row
 from lagros_benchmarks.training.sb3_vector import LinearFeatures, SB3VectorEnv
 from lagros_benchmarks.training.settings import CURVE, FINAL, OffPolicy, SingleTraining
 from lagros_envs.seeding import episode_seeds
@@ -132,21 +130,8 @@ class SingleLesson:
         """Return the figures at the end, without a disturbance and with that of the training."""
         run, policy = self.training, self.policy(model)
         seeds = episode_seeds(0, run.final_episodes, FINAL)
-        rows = []
-        for kind, bound in (("none", 0.0), (run.disturbance, run.disturbance_bound)):
-            figures = evaluate(policy, seeds, kind, bound)
-            successes = round(figures["success"] * len(seeds))
-            interval = wilson_interval(successes, len(seeds))
-            rows.append(
-                {
-                    "disturbance": kind,
-                    "bound": bound,
-                    "episodes": len(seeds),
-                    **rounded(figures),
-                    "success_ci95": [round(limit, 4) for limit in interval],
-                }
-            )
-        return rows
+        conditions = (("none", 0.0), (run.disturbance, run.disturbance_bound))
+        return [final_row(policy, seeds, kind, bound) for kind, bound in conditions]
 
     def save(self, model: BaseAlgorithm, path: Path) -> None:
         """Write the actor as safetensors."""
@@ -200,49 +185,3 @@ def _features(model: BaseAlgorithm) -> NDArray[Any]:
             return venv.matrix
         venv = getattr(venv, "venv", None)
     return np.eye((model.observation_space.shape or (0,))[0])
-
-
-def evaluate(policy: Any, seeds: list[int], disturbance: str, bound: float) -> dict[str, float]:
-    """Run a policy that remembers nothing over episodes of its `settings` and return its figures.
-
-    Returns:
-        Shares of episodes: `success` (the paper's), `strict` (inside the tube at the end, never
-        fell), `fallen` and, where there are discs, `collided`; means over all episodes: `effort`
-        (to the end, whatever it is) and `effort_to_success`; `final_distance`, the mean over those
-        that did not end early (0 if all did); `reward`, the mean of the task's own reward over an
-        episode.
-    """
-    venv = TaskVectorEnv(
-        len(seeds),
-        disturbance=disturbance,
-        disturbance_bound=bound,
-        settings=policy.settings,
-        compiled=False,
-        autoreset_mode="disabled",
-    )
-    loop = ClosedLoop(venv, policy)
-    going, rewards = np.ones(len(seeds), dtype=bool), np.zeros(len(seeds))
-    last: dict[str, NDArray[Any]] = {}
-    lost = np.zeros(len(seeds), dtype=bool)
-    for _ in loop.fly(seeds):
-        info = loop.info
-        kept = ("success", "effort", "effort_to_success", "fallen", "collided")
-        for key in kept:
-            if key in info:
-                last.setdefault(key, np.array(info[key]))[going] = info[key][going]
-        if loop.step:
-            rewards += np.where(going, loop.reward, 0.0)
-            lost |= going & loop.terminated
-            going &= ~loop.ended
-    standing = loop.info["goal_distance"][~lost]
-    collided = {"collided": float(np.mean(last["collided"]))} if "collided" in last else {}
-    return {
-        "success": float(np.mean(last["success"])),
-        "strict": float(np.mean(loop.info["inside_tube"] & ~lost)),
-        "fallen": float(np.mean(last["fallen"])),
-        **collided,
-        "effort": float(np.mean(last["effort"])),
-        "effort_to_success": float(np.mean(last["effort_to_success"])),
-        "final_distance": float(np.mean(standing)) if standing.size else 0.0,
-        "reward": float(np.mean(rewards)),
-    }
