@@ -14,7 +14,7 @@ PIP := $(BIN)/python -m pip install -c constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo test test-slow test-other-cpu lint format speed clean
+.PHONY: help install demo test test-slow test-other-cpu lint format docs speed clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -62,6 +62,10 @@ lint: install ## ruff and mypy
 format: install ## rewrite the code in the project's format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+docs: install ## the site, in site/index.html; ends with an error on any warning
+	$(BIN)/python docs/spec.py
+	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -j 2 docs site
 
 speed: $(SPEED_STAMP) ## micro-benchmarks against peers
 	$(BIN)/python benchmarks/speed/run.py

@@ -228,7 +228,9 @@ def main() -> None:
     env = gym.make("lagros/CartPole-v0", disable_env_checker=True)
     rows = []
     for name in _POLICIES:
-        row = flown(make(name, env), name, wanted.episodes)
+        # A part of the observation is moved, also to where no training was.
+        policy = make(name, env, allow_other_settings=True)
+        row = flown(policy, name, wanted.episodes)
         rows.append({**row, **bounded(row, certificate, wanted.episodes)})
     text = markdown(rows, certificate)
     sys.stdout.write(text)

@@ -1,0 +1,81 @@
+"""How the site is built: `make docs`. Sphinx reads the Markdown of this folder as it stands."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from latex2mathml.converter import convert
+
+ROOT = Path(__file__).resolve().parents[1]
+_PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+# Where the project is published; "" leaves out whatever needs an address.
+_REPOSITORY: str = _PYPROJECT["tool"]["lagros"]["repository"]
+
+project = "lagros"
+author = "lagros contributors"
+project_copyright = author
+version = release = _PYPROJECT["project"]["version"]
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+]
+source_suffix = {".md": "markdown"}
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_heading_anchors = 4
+nitpicky = False
+
+autodoc_typehints = "description"
+autodoc_member_order = "bysource"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+napoleon_numpy_docstring = False
+# The fields of a dataclass are described once, by its docstring.
+napoleon_use_ivar = True
+napoleon_custom_sections = [("Attributes of the class, to be set in a subclass", "Attributes")]
+
+html_theme = "furo"
+html_title = f"lagros {release}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_math_renderer = "mathml"
+html_copy_source = False
+html_theme_options: dict[str, Any] = {"navigation_with_keys": True}
+if _REPOSITORY:
+    html_theme_options |= {
+        "source_repository": _REPOSITORY,
+        "source_branch": "main",
+        "source_directory": "docs/",
+    }
+
+
+def _inline(translator: Any, node: Any) -> None:
+    translator.body.append(convert(node.astext()))
+    _skip(node)
+
+
+def _block(translator: Any, node: Any) -> None:
+    translator.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
+    _skip(node)
+
+
+def _skip(node: Any) -> None:
+    from docutils.nodes import SkipNode
+
+    raise SkipNode
+
+
+def _bars(app: Any, kind: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    # |x| is a size in our docstrings, never a substitution.
+    lines[:] = [line.replace("|", "\\|") for line in lines]
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Write formulas as MathML, which browsers show without a script or a font from elsewhere."""
+    app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
+    app.connect("autodoc-process-docstring", _bars)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

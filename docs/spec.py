@@ -1,0 +1,118 @@
+"""Write what the code says of each system into its page: spaces, limits, ends, defaults.
+
+    python docs/spec.py             # say which pages are not as the code is; status 1 if any is not
+    python docs/spec.py --update    # and write them
+
+Each page docs/systems/NAME.md has the marks `<!-- spec -->` and `<!-- end -->`; what stands between
+them is ours.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from lagros_envs.registry import find_task, task_names
+from lagros_envs.task import Task
+
+PAGES = Path(__file__).parent / "systems"
+BEGIN, END = "<!-- spec -->\n", "<!-- end -->"
+
+
+def specification(task: Task) -> str:
+    """Return the block of a task of one body."""
+    return "\n".join(["", *_facts(task), "", *_coordinates(task), ""]) + "\n"
+
+
+def _facts(task: Task) -> Iterator[str]:
+    yield "| | |"
+    yield "|---|---|"
+    yield f'| make | `gym.make("{task.env_id}")`, `lagros bench {task.name}` |'
+    yield f"| state, control | {task.system.state_dim}, {task.system.control_dim} |"
+    yield (
+        f"| observation | {task.layout.size} numbers: x, the goal, x(0), the time [s]"
+        + (f", and centre and radius of up to {task.most_discs} discs |" if task.most_discs else " |")
+    )
+    yield f"| control period, time limit | {task.control_period:g} s, {task.time_limit:g} s |"
+    yield f"| success | within {task.goal_radius:g} of the goal, and neither fallen nor in touch |"
+    bounds = ", ".join(f"{bound:g}" for bound in task.defaults.bounds)
+    yield f"| disturbance | ‖d‖ ≤ d̄ = {bounds} by default, in all states or in the rates alone |"
+    yield (
+        f"| reward, per step of dt | −{task.effort_weight:.3g} ‖u − u_0‖² dt, "
+        f"−{task.distance_weight:g} · distance dt, +{task.alive_bonus:g} dt while it goes on, "
+        f"+{task.success_bonus:g} at the first success |"
+    )
+    if task.presets:
+        yield f"| presets | {', '.join(f'`{name}`' for name in task.presets)} |"
+
+
+def _coordinates(task: Task) -> Iterator[str]:
+    yield "| state | plans keep it within |"
+    yield "|---|---|"
+    names = task.state_names or tuple(f"x{k}" for k in range(task.system.state_dim))
+    low = task.state_low or (-math.inf,) * len(names)
+    high = task.state_high or (math.inf,) * len(names)
+    for name, least, most in zip(names, low, high, strict=True):
+        yield f"| {name} | {_interval(least, most)} |"
+    yield ""
+    yield "| control | action 0 | action ±1 adds | applied within |"
+    yield "|---|---:|---:|---|"
+    controls = task.control_names or tuple(f"u{k}" for k in range(task.system.control_dim))
+    rows = zip(
+        controls,
+        task.control_centre,
+        task.control_scale,
+        task.control_low,
+        task.control_high,
+        strict=True,
+    )
+    for name, centre, scale, least, most in rows:
+        yield f"| {name} | {centre:.4g} | {scale:.4g} | {_interval(least, most)} |"
+
+
+def _interval(low: float, high: float) -> str:
+    if math.isinf(low) and math.isinf(high):
+        return "any"
+    return f"[{low:.4g}, {high:.4g}]"
+
+
+def updated(text: str, block: str) -> str:
+    """Return a page with the block between its marks.
+
+    Raises:
+        ValueError: A mark is missing.
+    """
+    if BEGIN not in text or END not in text.partition(BEGIN)[2]:
+        raise ValueError(f"the marks {BEGIN.strip()} and {END} are missing")
+    before, _, rest = text.partition(BEGIN)
+    return before + BEGIN + block + END + rest.partition(END)[2]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compare or write the pages; return the exit status."""
+    parser = argparse.ArgumentParser(description="What the code says of each system.")
+    parser.add_argument("--update", action="store_true", help="write the pages")
+    update = parser.parse_args(arguments).update
+    stale = []
+    for name in task_names():
+        task = find_task(name)
+        page = PAGES / f"{name}.md"
+        if not isinstance(task, Task):
+            continue
+        text = page.read_text(encoding="utf-8")
+        wanted = updated(text, specification(task))
+        if wanted != text:
+            stale.append(name)
+            if update:
+                page.write_text(wanted, encoding="utf-8")
+    if stale and not update:
+        print(f"not as the code is: {', '.join(stale)}; run: python docs/spec.py --update")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
