@@ -36,7 +36,7 @@ autodoc_default_options = {"members": True, "show-inheritance": True}
 napoleon_numpy_docstring = False
 # The fields of a dataclass are described once, by its docstring.
 napoleon_use_ivar = True
-napoleon_custom_sections = [("Attributes of the class, to be set in a subclass", "Attributes")]
+napoleon_custom_sections = [("Class attributes that a subclass sets", "Attributes")]
 
 html_theme = "furo"
 html_title = f"lagros {release}"

@@ -34,7 +34,11 @@ def _facts(task: Task) -> Iterator[str]:
     yield f"| state, control | {task.system.state_dim}, {task.system.control_dim} |"
     yield (
         f"| observation | {task.layout.size} numbers: x, the goal, x(0), the time [s]"
-        + (f", and centre and radius of up to {task.most_discs} discs |" if task.most_discs else " |")
+        + (
+            f", and centre and radius of up to {task.most_discs} discs |"
+            if task.most_discs
+            else " |"
+        )
     )
     yield f"| control period, time limit | {task.control_period:g} s, {task.time_limit:g} s |"
     yield f"| success | within {task.goal_radius:g} of the goal, and neither fallen nor in touch |"
@@ -91,8 +95,8 @@ def updated(text: str, block: str) -> str:
     return before + BEGIN + block + END + rest.partition(END)[2]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Compare or write the pages; return the exit status."""
+def main(arguments: Sequence[str] | None = None) -> str | None:
+    """Compare or write the pages; return what is wrong."""
     parser = argparse.ArgumentParser(description="What the code says of each system.")
     parser.add_argument("--update", action="store_true", help="write the pages")
     update = parser.parse_args(arguments).update
@@ -109,9 +113,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if update:
                 page.write_text(wanted, encoding="utf-8")
     if stale and not update:
-        print(f"not as the code is: {', '.join(stale)}; run: python docs/spec.py --update")
-        return 1
-    return 0
+        return f"not as the code is: {', '.join(stale)}; run: python docs/spec.py --update"
+    return None
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 `Task` describes one body. Its settings are fields, which `gym.make(..., settings={...})` changes;
 what cannot change without becoming another task is a plain attribute of the class; what has to be
-computed is a method. A task of your own is a subclass in a file of your own:
+computed is a method. A task of your own is a subclass in a file of your own::
 
     @dataclass(frozen=True)
     class Slide(Task):
@@ -159,7 +159,7 @@ class Task(Described):
         control_period: Zero-order hold [s].
         time_limit: Length of an episode, which is also that of a plan [s].
 
-    Attributes of the class, to be set in a subclass:
+    Class attributes that a subclass sets:
         state_names: Name and unit of each coordinate, "theta [rad]"; () for x0, x1, ...
         control_names: Likewise of each control.
         rates: Which coordinates are rates: those that `disturbance_channels="rates"` disturbs;

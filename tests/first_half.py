@@ -33,11 +33,11 @@ def blocks_and_commands(text: str) -> tuple[list[str], list[documents.Command]]:
     return documents.python_blocks(first), typed
 
 
-def write_modules(text: str) -> None:
-    """Write the modules that the README asks for: Write `mine.py`: and the next block."""
+def write_modules(text: str, folder: Path = Path()) -> None:
+    """Write the modules that a page asks for: Write `mine.py`: and the next block."""
     asked = r"Write\s+`(\w+\.py)`:\s+```python\n(.*?)^```"
     for name, block in re.findall(asked, text, re.MULTILINE | re.DOTALL):
-        Path(name).write_text(block, encoding="utf-8")
+        (folder / name).write_text(block, encoding="utf-8")
 
 
 def main(readme: Path) -> None:
