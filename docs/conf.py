@@ -11,7 +11,7 @@ from latex2mathml.converter import convert
 ROOT = Path(__file__).resolve().parents[1]
 _PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 # Where the project is published; "" leaves out whatever needs an address.
-_REPOSITORY: str = _PYPROJECT["tool"]["lagros"]["repository"]
+_REPOSITORY: str = _PYPROJECT["tool"]["hatch"]["metadata"]["hooks"]["custom"]["repository"]
 
 project = "lagros"
 author = "lagros contributors"

@@ -59,7 +59,7 @@ def notebook(name: str) -> str:
 def _install(name: str) -> Iterator[dict[str, Any]]:
     """Yield the first cells: how a stranger comes by the package."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    address = project["tool"]["lagros"]["repository"]
+    address = project["tool"]["hatch"]["metadata"]["hooks"]["custom"]["repository"]
     if not address:
         yield _markdown(
             'Needs `pip install -c constraints.txt ".[bench,rl]"` in the folder of the project.\n'

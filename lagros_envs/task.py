@@ -13,7 +13,8 @@ computed is a method. A task of your own is a subclass in a file of your own::
         def sample(self, rng):
             return Scenario(rng.uniform(-1.0, 1.0, 2), np.zeros(2))
 
-    register_task(Slide())           # gym.make("lagros/Slide-v0")
+
+    register_task(Slide())  # gym.make("lagros/Slide-v0")
 
 A part that a task leaves out is missing in what is built on it, and said there: without `metric`
 there is a planner, but neither u* nor a tube.

@@ -1,4 +1,4 @@
-"""The site says what the code says, its tutorial runs as it stands, and it builds without a warning."""
+"""The site says what the code says, its tutorial runs, and it builds without a warning."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ _NOT_RUN = ("make", "pip", "source", "git")
 
 def script(name: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / f"{name}.py")
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -42,12 +43,8 @@ def test_a_page_that_is_not_as_the_code_is_is_found() -> None:
 
 
 def test_a_page_becomes_cells_in_its_order() -> None:
-    cells = list(
-        script("notebooks")._cells(
-            "Write `mine.py`:\n\n```python\nx = 1\n```\n\nSee [it](../y.md):\n\n    lagros bench z\n",
-            Path("tutorial/page.md"),
-        )
-    )
+    text = "Write `mine.py`:\n\n```python\nx = 1\n```\n\nSee [it](../y.md):\n\n    lagros bench z\n"
+    cells = list(script("notebooks")._cells(text, Path("tutorial/page.md")))
     assert ["".join(cell["source"]) for cell in cells] == [
         "Write `mine.py`:",
         "%%writefile mine.py\nx = 1",

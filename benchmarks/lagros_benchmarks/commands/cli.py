@@ -13,6 +13,7 @@ from lagros_benchmarks.commands.attack import attack
 from lagros_benchmarks.commands.certify import certify
 from lagros_benchmarks.commands.check import check
 from lagros_benchmarks.commands.data import data
+from lagros_benchmarks.commands.doctor import doctor
 from lagros_benchmarks.commands.export import export
 from lagros_benchmarks.commands.extras import check_extra
 from lagros_benchmarks.commands.new import new
@@ -50,11 +51,19 @@ DEMO: dict[str, Any] = {}
 app = typer.Typer(
     cls=Commands,
     help="Learning-based robust motion planning with guaranteed stability.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_show_locals=False,
 )
 
+# What `lagros` alone prints.
+FIRST_STEPS = """lagros: robust learned motion planning with guarantees. Four things to try:
+
+  lagros demo                                          the paper's first experiment, half a minute
+  lagros watch spacecraft --seed 1                     six spacecraft fly among obstacles
+  lagros bench cartpole --policies tube-mpc,lagros,lqr --disturbance constant
+  lagros new mysystem.py                               a system of your own, in a file that runs
+
+All commands: lagros --help"""
 
 TASK = typer.Argument(help="{tasks}; or one of your own: module:attribute, or a .py file.")
 ANY_TASK = typer.Argument(
@@ -71,6 +80,7 @@ ADDRESS_OPTION = typer.Option(
 
 @app.callback(invoke_without_command=True)
 def main(
+    context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
 ) -> None:
     """Learning-based robust motion planning with guaranteed stability."""
@@ -79,6 +89,8 @@ def main(
 
         typer.echo(f"lagros {versions().get('lagros', '(run from its folder, not installed)')}")
         raise typer.Exit
+    if context.invoked_subcommand is None:
+        typer.echo(FIRST_STEPS)
 
 
 @app.command(cls=Command)
@@ -333,6 +345,7 @@ app.command(cls=Command)(certify)
 app.command(cls=Command)(train)
 app.command(cls=Command)(attack)
 app.command(cls=Command)(suite)
+app.command(cls=Command)(doctor)
 app.add_typer(data, name="data")
 
 
