@@ -112,6 +112,7 @@ def test_demo_writes_table_and_figure(invoke, faked, tmp_path, monkeypatch):
     assert result.exit_code == 0, result.output
     assert "(c) lagros" in result.stdout
     assert "runs/demo/error.png" in result.stdout
+    assert "runs/demo/report.html" in result.stdout
     assert (tmp_path / "runs/demo/error.png").exists()
     assert len(json.loads((tmp_path / "runs/demo/results.json").read_text())) == 4
 

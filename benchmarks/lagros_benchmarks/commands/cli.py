@@ -37,6 +37,7 @@ from lagros_benchmarks.commands.terminal import (
 from lagros_benchmarks.commands.train import train
 from lagros_benchmarks.commands.watch import watch
 from lagros_benchmarks.run.process import undone
+from lagros_envs.registry import first_task, task_named, task_names
 
 if TYPE_CHECKING:
     from lagros_benchmarks.report.delivery import Outputs
@@ -47,6 +48,13 @@ if TYPE_CHECKING:
 BENCH_FOLDER, DEMO_FOLDER = Path("runs/bench"), Path("runs/demo")
 # What the demonstration changes of the defaults, which are the paper's experiment: nothing.
 DEMO: dict[str, Any] = {}
+# And a short run of many bodies beside it.
+DEMO_WORLDS: dict[str, Any] = {
+    "policies": ("lagros", "centralized"),
+    "bounds": (0.4,),
+    "episodes": 2,
+    "timing_episodes": 1,
+}
 
 app = typer.Typer(
     cls=Commands,
@@ -58,10 +66,10 @@ app = typer.Typer(
 # What `lagros` alone prints.
 FIRST_STEPS = """lagros: robust learned motion planning with guarantees. Four things to try:
 
-  lagros demo                                          the paper's first experiment, half a minute
-  lagros watch spacecraft --seed 1                     six spacecraft fly among obstacles
-  lagros bench cartpole --policies tube-mpc,lagros,lqr --disturbance constant
-  lagros new mysystem.py                               a system of your own, in a file that runs
+  lagros demo                          the paper's first experiment, a report to click through
+  lagros watch {many} --seed 1     bodies that fly among obstacles
+  lagros bench {one} --policies tube-mpc,lagros,lqr --disturbance constant
+  lagros new mysystem.py               a system of your own, in a file that runs
 
 All commands: lagros --help"""
 
@@ -90,7 +98,12 @@ def main(
         typer.echo(f"lagros {versions().get('lagros', '(run from its folder, not installed)')}")
         raise typer.Exit
     if context.invoked_subcommand is None:
-        typer.echo(FIRST_STEPS)
+        typer.echo(FIRST_STEPS.format(one=first_task(), many=_first_world()))
+
+
+def _first_world() -> str:
+    """Return the first task of many bodies."""
+    return next(name for name in task_names() if task_named(name).most_agents > 1)
 
 
 @app.command(cls=Command)
@@ -263,16 +276,26 @@ def bench(
 
 @app.command(cls=Command)
 def demo() -> None:
-    """The paper's first experiment: 50 paired episodes, the table and the figure."""
+    """The paper's first experiment: 50 paired episodes; then a few worlds of agents; a report."""
     from lagros_benchmarks.report.delivery import Outputs
     from lagros_benchmarks.run.settings import BenchmarkSettings
 
-    outputs = Outputs(json=DEMO_FOLDER / "results.json", figure=DEMO_FOLDER / "error.png")
+    report = DEMO_FOLDER / "report.html"
+    outputs = Outputs(
+        json=DEMO_FOLDER / "results.json", figure=DEMO_FOLDER / "error.png", html=report
+    )
+    world = _first_world()
+    agents = Outputs(json=DEMO_FOLDER / f"{world}.json", html=DEMO_FOLDER / f"{world}.html")
     try:
         outputs.check()
+        agents.check()
     except ValueError as error:
         fail(error)
     run_and_report(BenchmarkSettings(**DEMO), outputs, DEMO_FOLDER)
+    usual = task_named(world).defaults
+    many = BenchmarkSettings(task=world, preset=usual.preset, agents=usual.agents, **DEMO_WORLDS)
+    run_and_report(many, agents, DEMO_FOLDER)
+    typer.echo(f"open {report} and {agents.html} in a browser: every episode there can be played")
 
 
 @app.command(cls=Command)
