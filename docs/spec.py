@@ -41,7 +41,8 @@ def _facts(task: Task) -> Iterator[str]:
         )
     )
     yield f"| control period, time limit | {task.control_period:g} s, {task.time_limit:g} s |"
-    yield f"| success | within {task.goal_radius:g} of the goal, and neither fallen nor in touch |"
+    radius = float(task.success_radius(task.time_limit))
+    yield f"| success | within {radius:.3g} of the goal, and neither fallen nor in touch |"
     bounds = ", ".join(f"{bound:g}" for bound in task.defaults.bounds)
     yield f"| disturbance | ‖d‖ ≤ d̄ = {bounds} by default, in all states or in the rates alone |"
     yield (
@@ -101,10 +102,12 @@ def main(arguments: Sequence[str] | None = None) -> str | None:
     parser.add_argument("--update", action="store_true", help="write the pages")
     update = parser.parse_args(arguments).update
     stale = []
-    for name in task_names():
-        task = find_task(name)
+    tasks = {name: find_task(name) for name in task_names()}
+    # A preset of a task stands on the page of the task.
+    presets = {f"{name}-{preset}" for name, task in tasks.items() for preset in task.presets}
+    for name, task in tasks.items():
         page = PAGES / f"{name}.md"
-        if not isinstance(task, Task):
+        if not isinstance(task, Task) or name in presets:
             continue
         text = page.read_text(encoding="utf-8")
         wanted = updated(text, specification(task))

@@ -18,7 +18,12 @@ from lagros_benchmarks.commands import cli
 from tests import documents
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted((ROOT / "benchmarks" / "studies").glob("*.md")),
+]
 SOURCES = ("benchmarks", "examples", "lagros_envs", "lagros_policies", "tests")
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 # What the command line raises; typer brings a click of its own.
