@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -74,8 +75,19 @@ def _bars(app: Any, kind: str, name: str, thing: Any, options: Any, lines: list[
     lines[:] = [line.replace("|", "\\|") for line in lines]
 
 
+def _elsewhere(app: Any, name: str, source: list[str]) -> None:
+    # Pages beside the code are no pages of the site: links to the repository, or words.
+    def target(found: re.Match[str]) -> str:
+        words, path = found.groups()
+        return f"[{words}]({_REPOSITORY}/blob/main/{path})" if _REPOSITORY else words
+
+    link = r"\[([^\]]*)\]\((?:\.\./)+((?:benchmarks|CONTRIBUTING|README)[^)\s]*\.md[^)\s]*)\)"
+    source[0] = re.sub(link, target, source[0])
+
+
 def setup(app: Any) -> dict[str, bool]:
     """Write formulas as MathML, which browsers show without a script or a font from elsewhere."""
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
     app.connect("autodoc-process-docstring", _bars)
+    app.connect("source-read", _elsewhere)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

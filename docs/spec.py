@@ -10,6 +10,7 @@ them is ours.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -19,12 +20,13 @@ from lagros_envs.registry import find_task, task_names
 from lagros_envs.task import Task
 
 PAGES = Path(__file__).parent / "systems"
+RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 BEGIN, END = "<!-- spec -->\n", "<!-- end -->"
 
 
 def specification(task: Task) -> str:
     """Return the block of a task of one body."""
-    return "\n".join(["", *_facts(task), "", *_coordinates(task), ""]) + "\n"
+    return "\n".join(["", *_facts(task), "", *_coordinates(task), *_flown(task), ""]) + "\n"
 
 
 def _facts(task: Task) -> Iterator[str]:
@@ -76,6 +78,38 @@ def _coordinates(task: Task) -> Iterator[str]:
     )
     for name, centre, scale, least, most in rows:
         yield f"| {name} | {centre:.4g} | {scale:.4g} | {_interval(least, most)} |"
+
+
+def _flown(task: Task) -> Iterator[str]:
+    """Yield the published table of the task."""
+    path = RESULTS / f"{task.name}.json"
+    if not path.is_file():
+        return
+    rows = json.loads(path.read_text(encoding="utf-8"))
+    kinds = list(dict.fromkeys(row["disturbance"] for row in rows))
+    count, bound = rows[0]["episodes"], rows[0]["bound"]
+    yield ""
+    yield (
+        f"Success of {count} paired episodes at d̄ = {bound:g} [%], strict success in brackets; "
+        f"effort under {kinds[0]}:"
+    )
+    yield ""
+    yield f"| policy | {' | '.join(kinds)} | effort | Δt [µs] |"
+    yield f"|---|{'---:|' * (len(kinds) + 2)}"
+    for policy in dict.fromkeys(row["policy"] for row in rows):
+        of = {row["disturbance"]: row for row in rows if row["policy"] == policy}
+        cells = [
+            f"{100 * of[kind]['success_rate']:.1f} ({100 * of[kind]['strict_success_rate']:.1f})"
+            for kind in kinds
+        ]
+        first = of[kinds[0]]
+        cells += [f"{first['effort_mean']:.3g}", f"{1e6 * first['step_time_median_s']:.0f}"]
+        yield f"| {policy} | {' | '.join(cells)} |"
+    yield ""
+    command = (
+        " ".join(rows[0]["command"]) if isinstance(rows[0]["command"], list) else rows[0]["command"]
+    )
+    yield f"    {command}"
 
 
 def _interval(low: float, high: float) -> str:
