@@ -77,7 +77,8 @@ class DockingSettings(Task):
         mpc_samples=0,
     )
     # A constant push of so much moves a chaser that does nothing by 540 m.
-    defaults = Defaults(bounds=(0.003,), bound=0.003)
+    # Ten minutes in a film of ten seconds.
+    defaults = Defaults(bounds=(0.003,), bound=0.003, speed=60.0)
 
     def sample(self, rng: np.random.Generator) -> Scenario:
         """Draw a start anywhere around the target, at up to 0.8 of the limit in any direction."""
