@@ -28,7 +28,7 @@ PAGES = {
     "swarm": "tutorial/swarm.md",
 }
 _PIECES = re.compile(
-    r"^```(?P<kind>\w+)\n(?P<fenced>.*?)^```\n|(?P<indented>(?:^    \S.*\n)+)",
+    r"^```(?P<kind>\w+)\n(?P<fenced>.*?)^```\n|(?P<indented>(?:^    \S[^\n]*\n)+)",
     re.MULTILINE | re.DOTALL,
 )
 # "Write `mine.py`:" before a block of Python.

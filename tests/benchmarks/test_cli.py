@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import lagros_policies
 from lagros_benchmarks.commands import cli
-from lagros_benchmarks.run import library
+from lagros_benchmarks.run import library, settings
 from lagros_envs.disturbances import KINDS
 from lagros_envs.registry import task_named, task_names
 from lagros_policies.policy import policy_names
@@ -108,6 +108,8 @@ def test_bench_runs_a_grid(invoke, faked, tmp_path):
 
 def test_demo_writes_table_and_figure(invoke, faked, tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "DEMO", cli.DEMO | {"episodes": 3})
+    few = settings.BenchmarkSettings(policies=("lqr",), episodes=2)
+    monkeypatch.setattr(cli, "a_few_worlds", lambda: few)
     result = invoke("demo")
     assert result.exit_code == 0, result.output
     assert "(c) lagros" in result.stdout

@@ -16,6 +16,7 @@ from lagros_benchmarks.commands.data import data
 from lagros_benchmarks.commands.doctor import doctor
 from lagros_benchmarks.commands.export import export
 from lagros_benchmarks.commands.extras import check_extra
+from lagros_benchmarks.commands.first_steps import a_few_worlds, first_steps
 from lagros_benchmarks.commands.new import new
 from lagros_benchmarks.commands.outputs import check_outputs, policy_files
 from lagros_benchmarks.commands.streams import printing_failed
@@ -37,7 +38,6 @@ from lagros_benchmarks.commands.terminal import (
 from lagros_benchmarks.commands.train import train
 from lagros_benchmarks.commands.watch import watch
 from lagros_benchmarks.run.process import undone
-from lagros_envs.registry import first_task, task_named, task_names
 
 if TYPE_CHECKING:
     from lagros_benchmarks.report.delivery import Outputs
@@ -46,32 +46,9 @@ if TYPE_CHECKING:
     from lagros_benchmarks.run.settings import BenchmarkSettings
 
 BENCH_FOLDER, DEMO_FOLDER = Path("runs/bench"), Path("runs/demo")
-# What the demonstration changes of the defaults, which are the paper's experiment: nothing.
-DEMO: dict[str, Any] = {}
-# And a short run of many bodies beside it.
-DEMO_WORLDS: dict[str, Any] = {
-    "policies": ("lagros", "centralized"),
-    "bounds": (0.4,),
-    "episodes": 2,
-    "timing_episodes": 1,
-}
+DEMO: dict[str, Any] = {}  # what the demonstration changes of the paper's experiment: nothing
 
-app = typer.Typer(
-    cls=Commands,
-    help="Learning-based robust motion planning with guaranteed stability.",
-    add_completion=False,
-    pretty_exceptions_show_locals=False,
-)
-
-# What `lagros` alone prints.
-FIRST_STEPS = """lagros: robust learned motion planning with guarantees. Four things to try:
-
-  lagros demo                          the paper's first experiment, a report to click through
-  lagros watch {many} --seed 1     bodies that fly among obstacles
-  lagros bench {one} --policies tube-mpc,lagros,lqr --disturbance constant
-  lagros new mysystem.py               a system of your own, in a file that runs
-
-All commands: lagros --help"""
+app = typer.Typer(cls=Commands, add_completion=False, pretty_exceptions_show_locals=False)
 
 TASK = typer.Argument(help="{tasks}; or one of your own: module:attribute, or a .py file.")
 ANY_TASK = typer.Argument(
@@ -98,12 +75,7 @@ def main(
         typer.echo(f"lagros {versions().get('lagros', '(run from its folder, not installed)')}")
         raise typer.Exit
     if context.invoked_subcommand is None:
-        typer.echo(FIRST_STEPS.format(one=first_task(), many=_first_world()))
-
-
-def _first_world() -> str:
-    """Return the first task of many bodies."""
-    return next(name for name in task_names() if task_named(name).most_agents > 1)
+        typer.echo(first_steps())
 
 
 @app.command(cls=Command)
@@ -280,22 +252,17 @@ def demo() -> None:
     from lagros_benchmarks.report.delivery import Outputs
     from lagros_benchmarks.run.settings import BenchmarkSettings
 
-    report = DEMO_FOLDER / "report.html"
-    outputs = Outputs(
-        json=DEMO_FOLDER / "results.json", figure=DEMO_FOLDER / "error.png", html=report
-    )
-    world = _first_world()
-    agents = Outputs(json=DEMO_FOLDER / f"{world}.json", html=DEMO_FOLDER / f"{world}.html")
+    place, pages = DEMO_FOLDER, [DEMO_FOLDER / "report.html", DEMO_FOLDER / "worlds.html"]
+    outputs = Outputs(json=place / "results.json", figure=place / "error.png", html=pages[0])
+    worlds = Outputs(json=place / "worlds.json", html=pages[1])
     try:
         outputs.check()
-        agents.check()
+        worlds.check()
     except ValueError as error:
         fail(error)
-    run_and_report(BenchmarkSettings(**DEMO), outputs, DEMO_FOLDER)
-    usual = task_named(world).defaults
-    many = BenchmarkSettings(task=world, preset=usual.preset, agents=usual.agents, **DEMO_WORLDS)
-    run_and_report(many, agents, DEMO_FOLDER)
-    typer.echo(f"open {report} and {agents.html} in a browser: every episode there can be played")
+    run_and_report(BenchmarkSettings(**DEMO), outputs, place)
+    run_and_report(a_few_worlds(), worlds, place)
+    typer.echo(f"open {pages[0]} and {pages[1]} in a browser: every episode there can be played")
 
 
 @app.command(cls=Command)

@@ -14,7 +14,6 @@ import typer
 from lagros_benchmarks.commands.extras import check_extra
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs
 from lagros_benchmarks.commands.terminal import fail, file_option, interrupted, listed
-from lagros_envs.files import write_atomic
 
 if TYPE_CHECKING:
     from lagros_benchmarks.training.c3m_run import C3mRun
@@ -155,6 +154,8 @@ def _train_one(
     parallel_env: bool,
     fill: bool,
 ) -> dict[str, Any]:
+    from lagros_envs.files import write_atomic
+
     check_extra("lagros train", "rl", "stable_baselines3")
     import torch
     from rich.console import Console
