@@ -20,7 +20,7 @@ settings.load_profile("lagros")
 @pytest.fixture(autouse=True)
 def tasks_of_a_test_end_with_it():
     """Forget the tasks that a test registers: the next one may call its own the same."""
-    known = [registry._FOUND, registry._CALLED, gymnasium.registry]
+    known = [registry._FOUND, registry._FOREIGN, registry._CALLED, gymnasium.registry]
     before = [dict(one) for one in known]
     yield
     for one, entries in zip(known, before, strict=True):

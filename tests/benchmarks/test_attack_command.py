@@ -102,7 +102,7 @@ def test_a_class_that_cannot_be_searched_is_explained(
     [
         (["spacecraft", "--method", "cma"], "leave --method out"),
         (["cartpole", "--replay", "none.npz"], "there is no file none.npz"),
-        (["boat"], "unknown task 'boat'"),
+        (["canoe"], "unknown task 'canoe'"),
         (["cartpole", "--goal", "speed"], "goal='speed'"),
         (["cartpole", "--method", "annealing"], "method='annealing'"),
         (["cartpole", "--bound", "-1"], "bound=-1.0"),

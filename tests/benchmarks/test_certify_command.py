@@ -298,7 +298,7 @@ def test_a_metric_of_the_axes_can_be_read_and_a_bad_one_is_refused(invoke, tmp_p
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("pendulum",),
+        ("metronome",),
         ("cartpole", "--policy", "nobody"),
         ("cartpole", "--episodes", "0", "--policy", "tube-mpc"),
         ("cartpole", "--largest", "--episodes", "3"),

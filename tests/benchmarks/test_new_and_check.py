@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from lagros_benchmarks.commands import cli
 from lagros_envs import registry
-from lagros_envs.registry import find_task, task_names
+from lagros_envs.registry import find_task
+from lagros_envs.tasks import SHIPPED
 
 
 @pytest.fixture
@@ -92,7 +93,7 @@ def test_what_cannot_be_written_is_refused(file, message, invoke):
     assert sorted(path.name for path in Path().iterdir()) == ["folder.py", "link.py", "there.py"]
 
 
-@pytest.mark.parametrize("name", task_names())
+@pytest.mark.parametrize("name", SHIPPED)
 def test_no_new_file_takes_the_name_of_a_shipped_task(name, invoke):
     result = invoke("new", f"{name}.py")
     assert result.exit_code == 2
