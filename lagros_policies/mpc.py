@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lagros_envs.arrays import FloatArray
+from lagros_envs.checks import shown
 from lagros_envs.task import Task
 from lagros_policies.planning import PlannerSettings, Trajectory
 from lagros_policies.planning.planner import Planner, planner_of
@@ -43,6 +44,10 @@ class MpcPolicy(ReplanningTubeMpcPolicy):
     def __init__(
         self, settings: Task | None = None, last_plan: float = 1.0, **planning: Any
     ) -> None:
+        if "law" in planning:
+            raise ValueError(
+                f"law={shown(planning['law'])}: mpc has the law of a plan; leave it out"
+            )
         super().__init__(settings, last_plan=last_plan, law="lqr", **planning)
         self.name = "mpc"
         self._rough = rough(self.settings)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lagros_envs.arrays import BoolArray, FloatArray
+from lagros_envs.checks import shown
 from lagros_envs.dynamics import control_matrix
 from lagros_envs.dynamics.system import state_dependent_coefficient
 from lagros_envs.task import Feedback, Task
@@ -38,6 +39,8 @@ class StateDependentRegulator:
             import scipy.linalg  # noqa: F401
         except ImportError as error:
             raise ImportError("sd-lqr needs SciPy: pip install 'lagros[policies]'") from error
+        if weights is not None and not isinstance(weights, Feedback):
+            raise ValueError(f"weights={shown(weights)} must be a Feedback, or left out")
         self.task, self.weights = task, weights or bryson_weights(task)
         self._costs = (np.diag(self.weights.state_weights), np.diag(self.weights.control_weights))
 

@@ -110,6 +110,8 @@ class TubeMpcPolicy(BasePolicy):
         check_above("deadline", deadline, 0)
         if isinstance(law, str):
             check_name("law", law, LAWS)
+        elif law is not None and not (callable(law) and hasattr(law, "name")):
+            raise ValueError(f"law={shown(law)} must be one of {', '.join(LAWS)}, or a law itself")
         if metric is None:
             if law in WITHIN_METRIC:
                 check_own_metric(task, allow_other_settings)

@@ -496,6 +496,7 @@ GENERAL = {
         "contraction.control.contracting_set",
         "contraction.cvstem.design_metric",
         "contraction.cvstem.design_on_pool",
+        "contraction.cvstem.least_condition",
         "contraction.cvstem.search_rate",
     ),
     *("remarks.adaptive.AdaptiveControl",),
