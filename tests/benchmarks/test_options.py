@@ -243,6 +243,17 @@ ROWS = {
     "attack": ATTACK | {"task": Row(NAMES, ("",))},
     "data export": DATA,
     "suite": SUITE,
+    "new": {
+        "file": Row((".", "../x", "a b.py", "ünï🚀.py"), ("",)),
+        "--discs": Row(FLAG, ("x.py",)),
+    },
+    "check": {
+        "task": Row(NAMES, ("",)),
+        "--episodes": Row(POSITIVE_WHOLE, CARTPOLE),
+        "--seed": Row(WHOLE),
+        "--json": Row(WRITTEN),
+    },
+    "doctor": {"--json": Row(FLAG, ("",))},
 }
 
 

@@ -27,6 +27,8 @@ WORK = (
     "lagros_benchmarks.report.playback.Playback.play",
     "lagros_benchmarks.report.playback.Playback.page",
     "lagros_benchmarks.run.demonstrations.demonstrate",
+    "lagros_benchmarks.run.suite.fly_task",
+    "lagros_policies.inspection.inspect_task",
 )
 START = {
     "bench": "bench spacecraft --policies learned --episodes 1",
@@ -37,6 +39,8 @@ START = {
     "export": "export lagros-cartpole",
     "data export": "data export --minari",
     "watch": "watch cartpole --policy lqr",
+    "suite": "suite cartpole",
+    "check": "check cartpole",
 }
 # Every option that takes a path: the suffix of the file that it writes, "" for a folder, and None
 # for what is read.
@@ -65,6 +69,13 @@ PATHS = {
     ("watch", "--video"): ".gif",
     ("watch", "--html"): ".html",
     ("watch", "--scenario"): None,
+    ("check", "--json"): ".json",
+    ("new", "--file"): None,  # is tried in test_new_and_check.py
+    ("suite", "--json"): ".json",
+    ("suite", "--markdown"): ".md",
+    ("suite", "--figure"): ".png",
+    ("suite", "--out"): "",
+    ("suite", "--from"): None,
 }
 WRITTEN = [(*key, suffix) for key, suffix in PATHS.items() if suffix is not None]
 FILES = [(command, option, suffix) for command, option, suffix in WRITTEN if suffix]

@@ -87,17 +87,17 @@ def test_nan_is_not_hidden_by_a_choice(answer, tmp_path):
     rows = np.repeat(row[None], len(row), axis=0)
     np.fill_diagonal(rows, np.nan)
     unread = np.zeros(len(row), bool)
-    unread[task.layout.initial_state] = True
-    unread[task.layout.goal] = ~np.isnan(view_goal(task, row))
+    for part in (task.layout.initial_state, task.layout.goal):
+        unread[part] = ~np.isnan(viewed(task, row, part))
     hidden = ~np.isnan(answer(source, rows)).all(axis=1)
     np.testing.assert_array_equal(hidden, unread)
     assert np.isfinite(answer(source, row[None])).all()
 
 
-def view_goal(task, row):
-    """NaN for each number of the goal that the features hold."""
+def viewed(task, row, part):
+    """NaN for each number of a part of the observation that the features hold."""
     found = []
-    for place in range(*task.layout.goal.indices(len(row))):
+    for place in range(*part.indices(len(row))):
         spoiled = row.copy().tolist()
         spoiled[place] = np.nan
         found.append(np.sum(view_of(task)(spoiled, functions).features))

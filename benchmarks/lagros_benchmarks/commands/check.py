@@ -47,7 +47,7 @@ def check(
     except ValueError as error:
         fail(error)
     find_users_modules([task])
-    name = task
+    name = task if len(task) <= 80 else f"{task[:79]}…"
     try:
         described: Any = find_task(task)
         name = described.name

@@ -22,6 +22,7 @@ MODULES = {
     "ray": ("ray",),
     "dask": ("distributed", "joblib"),
     "fast": ("numba",),
+    "pandas": ("pandas",),
 }
 
 

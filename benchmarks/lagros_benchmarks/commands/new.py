@@ -141,11 +141,11 @@ def written(file: Path, discs: bool = False) -> str:
 
     name = file.stem
     if file.suffix != ".py":
-        raise ValueError(f"{file} must end in .py")
+        raise ValueError(f"file: {file} must end in .py")
     if not _NAME.fullmatch(name) or keyword.iskeyword(name):
         raise ValueError(
-            f"{shown(name)} cannot be the name of a task: begin with a small letter, and go on "
-            "with small letters, digits, _ and -, as in my_boat.py"
+            f"file: {shown(name)} cannot be the name of a task: begin with a small letter, and go "
+            "on with small letters, digits, _ and -, as in my_boat.py"
         )
     title = "".join(part[:1].upper() + part[1:] for part in re.split("[-_]+", name))
     taken = {one.title.lower() for one in SHIPPED.values()} | set(SHIPPED)

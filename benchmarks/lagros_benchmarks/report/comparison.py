@@ -74,7 +74,7 @@ class Comparison:
         try:
             import pandas
         except ImportError as error:
-            raise ImportError("to_pandas() needs pandas: pip install pandas") from error
+            raise ImportError("to_pandas() needs pandas: pip install 'lagros[pandas]'") from error
         from lagros_benchmarks.report.tables import scalar_figures
 
         plain = [
