@@ -42,6 +42,7 @@ from lagros_policies.contraction import (
     verify_metric,
 )
 from lagros_policies.contraction.axis_gain import AxisGain
+from lagros_policies.contraction.cvstem import least_condition
 from lagros_policies.contraction.double_integrator import design_axis
 from lagros_policies.proof import bounds, hold, sets
 from lagros_policies.proof import condition as proof_condition
@@ -212,6 +213,7 @@ def test_a_design_holds_by_brute_force_or_is_refused(system, degree):
             design,
             lambda: design_on_pool(system, samples, region, settings),
             lambda: search_rate(system, samples, region, settings, [0.05]),
+            lambda: least_condition(system, samples, region, settings),
         ):
             with pytest.raises(ValueError, match=r"control 0 of .* moves a metric of the state"):
                 ask()
@@ -221,8 +223,13 @@ def test_a_design_holds_by_brute_force_or_is_refused(system, degree):
     except contraction.InfeasibleError:
         # The unicycle and the upright pole without its angle have no such metric.
         assert isinstance(system, Unicycle | Swapped | Pvtol)
+        with pytest.raises(contraction.InfeasibleError):
+            least_condition(system, samples, region, settings)
         return
     assert brute_residual(system, metric, samples).max() <= 0.0
+    # The first program of the design: its bounds are at a few places, so that it is no worse.
+    least = least_condition(system, samples, region, settings)
+    assert 1.0 <= least <= metric.condition_bound * 1.02
 
 
 def test_scalings_and_samples_of_another_system_are_refused():
