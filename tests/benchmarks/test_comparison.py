@@ -125,7 +125,7 @@ def test_it_is_shown_as_table_frame_and_figure(tmp_path, monkeypatch):
 
     original = builtins.__import__
     monkeypatch.setattr(builtins, "__import__", missing)
-    with pytest.raises(ImportError, match="pip install pandas"):
+    with pytest.raises(ImportError, match=r"pip install 'lagros\[pandas\]'"):
         result.to_pandas()
 
 
