@@ -9,11 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lagros_envs.arrays import FloatArray
+from lagros_envs.passages import draw_fields, passages_open
 from lagros_envs.task import Defaults, Feedback, Learning, MetricDesign, Scenario, Task
 from lagros_envs.tasks.car.physics import Car
 
 _DISC_RADIUS = 0.5  # [m]
 _PASSAGE = 0.15  # between two discs a body has twice as much room [m]
+_FEWEST = 3  # discs
+_LOW, _HIGH = (1.5, -2.5), (7.5, 2.5)  # of their middles [m]
 
 
 @dataclass(frozen=True)
@@ -81,17 +84,26 @@ class CarSettings(Task):
     def sample(self, rng: np.random.Generator) -> Scenario:
         """Draw start, goal and discs between them, all passages open."""
         start, goal = (np.array([x, *rng.uniform((-2, -0.5), (2, 0.5)), 1.5]) for x in (0.0, 9.0))
-        keep = _DISC_RADIUS + self.body_radius + _PASSAGE
         ends = np.stack([start[:2], goal[:2]])
         while True:
-            count = int(rng.integers(3, self.most_discs + 1))
-            low, high = (1.5, -2.5, _DISC_RADIUS), (7.5, 2.5, _DISC_RADIUS)
-            discs = rng.uniform(low, high, (count, 3))
-            apart = np.linalg.norm(discs[:, None, :2] - discs[:, :2], axis=-1)
-            apart += 1e9 * np.eye(count)
-            gaps = np.linalg.norm(discs[:, None, :2] - ends, axis=-1)
-            if np.all(apart >= 2.0 * keep) and np.all(gaps >= keep + 0.1):
+            count = int(rng.integers(_FEWEST, self.most_discs + 1))
+            discs = rng.uniform((*_LOW, _DISC_RADIUS), (*_HIGH, _DISC_RADIUS), (count, 3))
+            if passages_open(discs[:, :2], ends, self._keep):
                 return Scenario(start, goal, discs)
+
+    def sample_many(self, rng: np.random.Generator, count: int) -> Scenario:
+        """Draw as `sample` does, all at once."""
+        ends = np.empty((count, 2, 4))
+        ends[..., 0], ends[..., 3] = (0.0, 9.0), 1.5
+        ends[..., 1:3] = rng.uniform((-2, -0.5), (2, 0.5), (count, 2, 2))
+        number = (_FEWEST, self.most_discs)
+        discs = draw_fields(rng, ends[..., :2], _LOW, _HIGH, number, _DISC_RADIUS, self._keep)
+        return Scenario(ends[:, 0], ends[:, 1], discs)
+
+    @property
+    def _keep(self) -> float:
+        """From the middle of a disc to where the body passes [m]."""
+        return _DISC_RADIUS + self.body_radius + _PASSAGE
 
     def outline(self, state: FloatArray) -> Sequence[FloatArray]:
         """Return the body with its nose, within the circle that collides."""

@@ -63,7 +63,7 @@ class DockingSettings(Task):
         margin=1e-3,
         scaling=(1.0, 1.0, 30.0, 30.0),
     )
-    # By benchmarks/studies/plan_law.py --task docking: no kind of disturbance costs an episode.
+    # No kind of disturbance costs an episode: `lagros bench docking --policies tube-mpc`.
     feedback = Feedback((1.0, 1.0, 100.0, 100.0), (20.0, 20.0), rate=0.02)
     learning = Learning(
         plans=1000,
@@ -76,8 +76,8 @@ class DockingSettings(Task):
         slope_weight=0.3,
         mpc_samples=0,
     )
-    # A constant push of so much moves a chaser that does nothing by 540 m.
-    # Ten minutes in a film of ten seconds.
+    # A constant push of so much moves a chaser that does nothing by 540 m. Ten minutes make a film
+    # of ten seconds.
     defaults = Defaults(bounds=(0.003,), bound=0.003, speed=60.0)
 
     def sample(self, rng: np.random.Generator) -> Scenario:
@@ -88,6 +88,15 @@ class DockingSettings(Task):
         start = [distance * math.cos(bearing), distance * math.sin(bearing)]
         start += [speed * math.cos(course), speed * math.sin(course)]
         return Scenario(np.array(start), np.zeros(4))
+
+    def sample_many(self, rng: np.random.Generator, count: int) -> Scenario:
+        """Draw as `sample` does, all at once."""
+        distance, share = rng.uniform((_NEAR, 0.0), (_FAR, _FIRST), (count, 2)).T
+        bearing, course = rng.uniform(0.0, 2.0 * math.pi, (2, count))
+        speed = share * (self.dock_speed + 2.0 * self.system.mean_motion * distance)
+        place = distance * np.cos(bearing), distance * np.sin(bearing)
+        starts = np.stack([*place, speed * np.cos(course), speed * np.sin(course)], axis=-1)
+        return Scenario(starts, np.zeros((count, 4)))
 
     def excess(self, state: Sequence[Any], functions: Any) -> Any:
         """Return by how much the chaser is faster than the limit [m/s], 1e-3 at most too much."""

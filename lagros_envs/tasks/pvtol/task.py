@@ -11,6 +11,7 @@ import numpy as np
 
 from lagros_envs.arrays import FloatArray
 from lagros_envs.draw import rotor_outline
+from lagros_envs.passages import draw_fields, passages_open
 from lagros_envs.task import Defaults, Feedback, Learning, MetricDesign, Scenario, Task
 from lagros_envs.tasks.pvtol.physics import Pvtol
 
@@ -18,6 +19,8 @@ _TILT = math.pi / 3.0  # of plans, and their largest dphi/dt [rad, rad/s]
 _HOVER = Pvtol().hover
 _DISC_RADIUS = 0.5  # [m]
 _PASSAGE = 0.15  # between two discs a body has twice as much room [m]
+_FEWEST = 3  # discs
+_LOW, _HIGH = (1.2, -1.5), (4.8, 1.5)  # of their middles [m]
 
 
 @dataclass(frozen=True)
@@ -102,17 +105,28 @@ class PvtolSettings(Task):
         """Draw a start at the left, a goal at the right, and discs between with open passages."""
         start, goal = np.zeros(6), np.zeros(6)
         start[1], goal[:2] = rng.uniform(-1.5, 1.5), (6.0, rng.uniform(-1.5, 1.5))
-        keep = _DISC_RADIUS + self.body_radius + _PASSAGE
         ends = np.stack([start[:2], goal[:2]])
         while True:
-            count = int(rng.integers(3, self.most_discs + 1))
-            across, aside = rng.uniform(1.2, 4.8, count), rng.uniform(-1.5, 1.5, count)
-            centres = np.stack([across, aside], axis=-1)
-            apart = np.linalg.norm(centres[:, None] - centres, axis=-1) + 1e9 * np.eye(count)
-            gaps = np.linalg.norm(centres[:, None] - ends, axis=-1)
-            if np.all(apart >= 2.0 * keep) and np.all(gaps >= keep + 0.1):
+            count = int(rng.integers(_FEWEST, self.most_discs + 1))
+            both = zip(_LOW, _HIGH, strict=True)
+            centres = np.stack([rng.uniform(*bounds, count) for bounds in both], axis=-1)
+            if passages_open(centres, ends, self._keep):
                 discs = np.concatenate([centres, np.full((count, 1), _DISC_RADIUS)], axis=-1)
                 return Scenario(start, goal, discs)
+
+    def sample_many(self, rng: np.random.Generator, count: int) -> Scenario:
+        """Draw as `sample` does, all at once."""
+        ends = np.zeros((count, 2, 6))
+        ends[:, 1, 0] = 6.0
+        ends[..., 1] = rng.uniform(-1.5, 1.5, (count, 2))
+        number = (_FEWEST, self.most_discs)
+        discs = draw_fields(rng, ends[..., :2], _LOW, _HIGH, number, _DISC_RADIUS, self._keep)
+        return Scenario(ends[:, 0], ends[:, 1], discs)
+
+    @property
+    def _keep(self) -> float:
+        """From the middle of a disc to where the body passes [m]."""
+        return _DISC_RADIUS + self.body_radius + _PASSAGE
 
     def excess(self, state: Sequence[Any], functions: Any) -> Any:
         """Return by how much the body tilts beyond a right angle [rad]."""
