@@ -135,8 +135,9 @@ def errors_between(
     bends = [_size(one - other) for one, other in zip(flown.bend, planned.bend, strict=True)]
     bend = np.stack([np.broadcast_to(one, len(begin)) for one in bends], axis=-1)
     size = np.abs(directions).T
-    ends = np.maximum(outputs[:, :-1][known], outputs[:, 1:][known] + defect @ size * _WIDE)
-    found = (ends + (0.125 * period * period) * (bend @ size)) * _WIDE
+    with np.errstate(invalid="ignore"):  # of what has overflown: no number, and so not known
+        ends = np.maximum(outputs[:, :-1][known], outputs[:, 1:][known] + defect @ size * _WIDE)
+        found = (ends + (0.125 * period * period) * (bend @ size)) * _WIDE
     shown = (flown.known & planned.known)[:, None] & ~np.isnan(found)
     between[known] = np.where(shown, found, np.inf)
     return between

@@ -120,6 +120,22 @@ def test_the_cartpole_is_guaranteed_and_a_search_comes_near_the_bound(cartpole_e
     assert theta < bounds["theta"] < math.pi / 2
 
 
+def test_what_is_not_known_between_the_instants_is_not_claimed(cartpole_evidence):
+    loop, found = cartpole_evidence
+    unknown = found.proved.error.copy()
+    unknown[0] = np.inf
+    some = replace(found, proved=replace(found.proved, error=unknown))
+    none = replace(found, proved=replace(found.proved, error=np.full_like(unknown, np.inf)))
+    said, less, least = (
+        words.proved_lines(SHORT, loop, one)[0].text for one in (found, some, none)
+    )
+    assert "instants and between them: " in said
+    assert f"and between them around {np.sum(found.proved.closed) - 1}: " in less
+    assert "instants alone: " in least
+    assert "by coordinate" not in least
+    assert not any("inf" in one for one in (said, less, least))
+
+
 @pytest.mark.parametrize("flown", [-1.0, 0.4, 2.5])
 def test_a_planted_wrong_gain_is_refuted(flown):
     """The tubes are of one gain, another flies: the search finds it out, whatever is proved."""

@@ -50,15 +50,22 @@ def proved_lines(task: Task, loop: Loop, found: Evidence) -> list[Statement]:
         return []
     closed = proved.closed
     plans, names = len(closed), coordinates(task)
-    widest = proved.error[closed].max(axis=0)
+    # A hold that is long for the motion may leave nothing known between two instants.
+    between = proved.error[closed & np.isfinite(proved.error).all(axis=1)]
+    where = "at the control instants and between them"
+    if len(between) < closed.sum():
+        where = "at the control instants"
+        where += f", and between them around {len(between)}" if len(between) else " alone"
     sizes = ", ".join(
-        f"{at_most(float(size), _DIGITS)} {name}" for size, name in zip(widest, names, strict=True)
+        f"{at_most(float(size), _DIGITS)} {name}"
+        for size, name in zip(between.max(axis=0, initial=0.0), names, strict=True)
     )
+    by_coordinate = f", by coordinate {sizes}" if len(between) else ""
     control = at_most(float(proved.deviation[closed].max()), _DIGITS)
     tube = (
         f"no disturbance up to d_bar takes the state out of its tube around {int(closed.sum())} of "
-        f"{plans} plans, at the control instants and between them: ||x - x_d|| <= "
-        f"{at_most(float(proved.norm[closed].max()), _DIGITS)}, by coordinate {sizes}; u stays "
+        f"{plans} plans, {where}: ||x - x_d|| <= "
+        f"{at_most(float(proved.norm[closed].max()), _DIGITS)}{by_coordinate}; u stays "
         f"within {control} of u_d ({found.proof_seconds / plans:.2g} s a plan)"
     )
     lines = [Statement(tube, "proved", True, found.proof_seconds)]

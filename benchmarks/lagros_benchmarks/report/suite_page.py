@@ -226,9 +226,10 @@ def _learned(systems: Sequence[System]) -> str:
     if not shares:
         return ""
     return (
-        f"What {RIVALS[0]} promises, contraction over a hold at its rate, was observed at this share "
-        f"of fresh states: {', '.join(shares)}. Where that is near zero it flies without what its "
-        "method is about, and to be ahead of it says little. One recipe trained it for all systems."
+        f"What {RIVALS[0]} promises, contraction over a hold at its rate, was observed at this "
+        f"share of fresh states: {', '.join(shares)}. Where that is near zero it flies without "
+        "what its method is about, and to be ahead of it says little. One recipe trained it for "
+        "all systems."
     )
 
 
