@@ -16,8 +16,9 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from lagros_envs.registry import find_task, task_names
+from lagros_envs.registry import find_task
 from lagros_envs.task import Task
+from lagros_envs.tasks import SHIPPED
 
 PAGES = Path(__file__).parent / "systems"
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
@@ -136,7 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> str | None:
     parser.add_argument("--update", action="store_true", help="write the pages")
     update = parser.parse_args(arguments).update
     stale = []
-    tasks = {name: find_task(name) for name in task_names()}
+    tasks = {name: find_task(name) for name in SHIPPED}
     # A preset of a task stands on the page of the task.
     presets = {f"{name}-{preset}" for name, task in tasks.items() for preset in task.presets}
     for name, task in tasks.items():

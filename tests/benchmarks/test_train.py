@@ -19,7 +19,7 @@ pytest.importorskip("stable_baselines3")
 from stable_baselines3.common.vec_env import VecNormalize
 
 from lagros_benchmarks.run.settings import BenchmarkSettings
-from lagros_benchmarks.training import single
+from lagros_benchmarks.training import evaluation, single
 from lagros_benchmarks.training.agent import make_agent
 from lagros_benchmarks.training.course import course_of, default_training, lesson_of
 from lagros_benchmarks.training.run import Place, train
@@ -118,7 +118,8 @@ def test_the_figures_are_of_episodes_that_neither_training_nor_the_benchmark_mee
         flown.append((seeds, *condition))
         return {"success": 0.8}
 
-    monkeypatch.setattr(single, "evaluate", spy)
+    for module in (single, evaluation):
+        monkeypatch.setattr(module, "evaluate", spy)
     model = make_agent(training, lesson.venv)
     lesson.figures(model)
     rows = lesson.final(model)
