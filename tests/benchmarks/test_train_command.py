@@ -165,7 +165,7 @@ def test_the_folder_of_a_run_names_what_it_is(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["cartpole", "--algo", "trpo"], "Use one of ppo, sac, td3"),
+        (["cartpole", "--algo", "trpo"], "Use one of ppo, sac, td3, c3m, missing"),
         (["spacecraft", "--algo", "sac"], "not known for spacecraft"),
         (["rocket"], "Valid: cartpole, spacecraft"),
         (["cartpole", "--seed", "-1"], "seed=-1"),

@@ -126,9 +126,11 @@ def train(
 
 def _run(task: str, name: str, seed: int, changes: dict[str, Any]) -> Training | C3mRun:
     from lagros_benchmarks.training.course import default_training
+    from lagros_envs.registry import find_task
 
     if name != _C3M:
-        return replace(default_training(task, name), seed=seed, **changes)
+        others = () if find_task(task).most_agents > 1 else (_C3M, _MISSING)
+        return replace(default_training(task, name, others), seed=seed, **changes)
     from lagros_benchmarks.training.c3m_run import C3mRun
 
     return C3mRun(task).seeded(seed)

@@ -5,7 +5,7 @@ Nothing here needs torch; the lesson does, and is imported when it begins.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from lagros_benchmarks.report.formats import number, percent, with_interval
@@ -106,8 +106,13 @@ def lesson_of(training: Training, parallel_env: bool = False) -> Any:
     return course_of(find_task(training.task)).lesson(training, parallel_env)
 
 
-def default_training(task: str, algorithm: str) -> Training:
+def default_training(task: str, algorithm: str, others: Sequence[str] = ()) -> Training:
     """Return the settings of a task and algorithm.
+
+    Args:
+        task: Name of the task.
+        algorithm: Of reinforcement learning.
+        others: What else the command takes in its place, for the message.
 
     Raises:
         ValueError: There are none.
@@ -116,7 +121,7 @@ def default_training(task: str, algorithm: str) -> Training:
     known: Mapping[str, Training] = course_of(described).trainings(described)
     if algorithm not in known:
         raise ValueError(
-            f"--algo {shown(algorithm)} is not known for {task}.{suggestion(algorithm, known)} "
-            f"Use one of {', '.join(known)}"
+            f"--algo {shown(algorithm)} is not known for {task}."
+            f"{suggestion(algorithm, (*known, *others))} Use one of {', '.join((*known, *others))}"
         )
     return known[algorithm]
