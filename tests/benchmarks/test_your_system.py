@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 import shutil
 
+import gymnasium
 import pytest
 from typer.testing import CliRunner
 
 from lagros_benchmarks.commands import cli
 from lagros_envs import registry
+from lagros_envs.tasks import SHIPPED
 from tests import documents
 from tests.found import ROOT
 
@@ -31,7 +33,11 @@ TINY = "Learning(20, 400, 0.03, (8,), 1, 1, scheduled=True, slope_weight=0.3, mp
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """An empty folder to work in, in which no task but the shipped ones is known."""
-    monkeypatch.setattr(registry, "_FOUND", dict(registry._FOUND))
+    shipped = {name: task for name, task in registry._FOUND.items() if name in SHIPPED}
+    strangers = [task.env_id for name, task in registry._FOUND.items() if name not in SHIPPED]
+    monkeypatch.setattr(registry, "_FOUND", shipped)
+    for env_id in strangers:
+        monkeypatch.delitem(gymnasium.registry, env_id, raising=False)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -39,8 +39,8 @@ def test_many_scenarios_are_drawn_by_the_law_of_one(name):
     many = task.sample_many(rng, count)
     each = task.sample_each(np.random.default_rng(index) for index in range(count))
     for part in ("initial_state", "goal", "discs"):
+        assert getattr(many, part).shape == getattr(each, part).shape
         first, second = (getattr(one, part).reshape(count, -1) for one in (many, each))
-        assert first.shape == second.shape
         for column in range(first.shape[-1]):
             # Of a hundred comparisons none of the same law comes below by chance.
             assert ks_2samp(first[:, column], second[:, column], method="asymp").pvalue > 1e-5, (

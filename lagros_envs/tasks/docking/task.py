@@ -96,7 +96,7 @@ class DockingSettings(Task):
         speed = share * (self.dock_speed + 2.0 * self.system.mean_motion * distance)
         place = distance * np.cos(bearing), distance * np.sin(bearing)
         starts = np.stack([*place, speed * np.cos(course), speed * np.sin(course)], axis=-1)
-        return Scenario(starts, np.zeros((count, 4)))
+        return Scenario(starts, np.zeros((count, 4)), np.zeros((count, 0, 3)))
 
     def excess(self, state: Sequence[Any], functions: Any) -> Any:
         """Return by how much the chaser is faster than the limit [m/s], 1e-3 at most too much."""
