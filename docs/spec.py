@@ -19,15 +19,22 @@ from pathlib import Path
 from lagros_envs.registry import find_task
 from lagros_envs.task import Task
 from lagros_envs.tasks import SHIPPED
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS
+from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 
 PAGES = Path(__file__).parent / "systems"
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 BEGIN, END = "<!-- spec -->\n", "<!-- end -->"
 
 
-def specification(task: Task) -> str:
-    """Return the block of a task of one body."""
-    return "\n".join(["", *_facts(task), "", *_coordinates(task), *_flown(task), ""]) + "\n"
+def specification(task: Task | SpacecraftSettings) -> str:
+    """Return the block of a task."""
+    if isinstance(task, Task):
+        lines = [*_facts(task), "", *_coordinates(task), *_flown(task)]
+    else:
+        lines = [*_facts_of_many(task), "", *_presets(task)]
+    return "\n".join(["", *lines, ""]) + "\n"
 
 
 def _facts(task: Task) -> Iterator[str]:
@@ -79,6 +86,60 @@ def _coordinates(task: Task) -> Iterator[str]:
     )
     for name, centre, scale, least, most in rows:
         yield f"| {name} | {centre:.4g} | {scale:.4g} | {_interval(least, most)} |"
+
+
+def _facts_of_many(task: SpacecraftSettings) -> Iterator[str]:
+    defaults = task.defaults
+    preset = PRESETS[str(defaults.preset)]
+    layout = Layout.for_preset(preset, task)
+    yield "| | |"
+    yield "|---|---|"
+    yield (
+        f'| make | `{task.name}_v0.parallel_env()` (PettingZoo), `gym.make("{task.env_id}")` for '
+        f"one agent, `lagros bench {task.name}` |"
+    )
+    yield f"| agents | 1 to {task.most_agents}, {preset.agents} by default |"
+    yield f"| state, control of each | {task.system.state_dim}, {task.system.control_dim} |"
+    size = sum(math.prod(shape) for shape in layout.shapes.values())
+    parts = ", ".join(
+        f"{name} {' × '.join(map(str, shape))}" for name, shape in layout.shapes.items()
+    )
+    yield f"| observation of each, preset {defaults.preset} | {size} numbers: {parts} |"
+    yield f"| senses | what is within {task.sensing_radius:g} m |"
+    most = "unlimited" if task.thrust_limit is None else f"at most {task.thrust_limit:g} N"
+    yield f"| action of each | 8 thrusts ≥ 0 in units of {task.thrust_scale:g} N, {most} |"
+    yield f"| control period, time limit | {task.control_period:g} s, {task.time_limit:g} s |"
+    yield (
+        f"| success | within {task.goal_radius:g} m of the goal at a control instant, before any "
+        "collision |"
+    )
+    bounds = ", ".join(f"{bound:g}" for bound in defaults.bounds)
+    yield (
+        f"| disturbance | ‖d‖ ≤ d̄ = {bounds} by default, of each agent, in all states or in the "
+        "rates alone |"
+    )
+    yield (
+        f"| reward of each | +{task.progress_weight:g} per metre nearer, "
+        f"−{task.effort_weight:g} ∫‖u‖² dt, +{task.success_bonus:g} at the first success, "
+        f"−{task.collision_penalty:g} at the first collision |"
+    )
+
+
+def _presets(task: SpacecraftSettings) -> Iterator[str]:
+    yield "| preset | agents | arena [m] | obstacles | radius [m]: obstacle, agent, to obstacles |"
+    yield "|---|---:|---:|---:|---:|"
+    for name in task.presets:
+        preset = PRESETS[name]
+        fewest, most = preset.obstacle_count
+        arena = f"{preset.arena:g}" + (f" · √(n/{preset.agents})" if preset.grows else "")
+        if preset.layout == "antipodal":
+            arena = "a circle, each goal opposite"
+        count = f"{fewest} to {most}" if fewest < most else f"{most}"
+        count += f", · n/{preset.agents}" if preset.grows else ""
+        yield (
+            f"| `{name}` | {preset.agents} | {arena} | {count} | {preset.obstacle_radius:g}, "
+            f"{preset.agent_radius:g}, {preset.core:g} |"
+        )
 
 
 def _flown(task: Task) -> Iterator[str]:
@@ -142,7 +203,7 @@ def main(arguments: Sequence[str] | None = None) -> str | None:
     presets = {f"{name}-{preset}" for name, task in tasks.items() for preset in task.presets}
     for name, task in tasks.items():
         page = PAGES / f"{name}.md"
-        if not isinstance(task, Task) or name in presets:
+        if name in presets or not isinstance(task, Task | SpacecraftSettings):
             continue
         text = page.read_text(encoding="utf-8")
         wanted = updated(text, specification(task))

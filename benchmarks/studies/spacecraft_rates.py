@@ -8,6 +8,9 @@ every agent arriving. (c) has no rate; it is flown as it ships, with and without
     python benchmarks/studies/spacecraft_rates.py [--worlds 20] [--bound 0.2,0.6,1.0]
         [--rates 0.5,0.7,1,1.5,2,3,4] [--policies centralized,tube-mpc,lagros] [--json FILE]
         [--markdown FILE] [--figure FILE]
+
+Rows that the file of `--json` has of the same worlds are kept and not flown again; table and figure
+are of all of them.
 """
 
 from __future__ import annotations
@@ -157,6 +160,12 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
+def _key(row: dict[str, Any]) -> tuple[Any, ...]:
+    """Return which row of the table it is."""
+    names = ("policy", "law", "contraction_rate", "safety_filter", "bound")
+    return tuple(row.get(name) for name in names)
+
+
 def main() -> None:
     """Run the study from the command line."""
     parser = argparse.ArgumentParser(description="Success against effort, by law and rate.")
@@ -169,9 +178,16 @@ def main() -> None:
     options = parser.parse_args()
     rates = [float(part) for part in options.rates.split(",")]
     rows: list[dict[str, Any]] = []
+    if options.json is not None and options.json.is_file():
+        rows = json.loads(options.json.read_text(encoding="utf-8"))
+        rows = [row for row in rows if row["worlds"] == options.worlds]
+    flown = [_key(row) for row in rows]
     console = Console()
     for bound in (float(part) for part in options.bound.split(",")):
         for variant in variants(options.policies.split(","), rates):
+            name, given, filtered = variant
+            if _key({"policy": name, **given, "safety_filter": filtered, "bound": bound}) in flown:
+                continue
             rows.append(study(*variant, bound, options.worlds))
             console.print(markdown(rows[-1:]).splitlines()[-1], soft_wrap=True)
             if options.json is not None:
