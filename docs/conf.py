@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
+from docutils.parsers.rst import Directive
 from latex2mathml.converter import convert
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -43,6 +46,7 @@ html_theme = "furo"
 html_title = f"lagros {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_js_files = [("filter.js", {"defer": "defer"})]
 html_math_renderer = "mathml"
 html_copy_source = False
 html_theme_options: dict[str, Any] = {"navigation_with_keys": True}
@@ -65,9 +69,7 @@ def _block(translator: Any, node: Any) -> None:
 
 
 def _skip(node: Any) -> None:
-    from docutils.nodes import SkipNode
-
-    raise SkipNode
+    raise nodes.SkipNode
 
 
 def _bars(app: Any, kind: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
@@ -85,9 +87,23 @@ def _elsewhere(app: Any, name: str, source: list[str]) -> None:
     source[0] = re.sub(link, target, source[0])
 
 
+class ResultsTable(Directive):
+    """`{results-table}`: every published row, which a reader may filter and sort."""
+
+    def run(self) -> list[nodes.Node]:
+        """Return the table."""
+        spec = importlib.util.spec_from_file_location("results", ROOT / "docs" / "results.py")
+        assert spec is not None
+        assert spec.loader is not None
+        results = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(results)
+        return [nodes.raw("", results.page(results.rows()), format="html")]
+
+
 def setup(app: Any) -> dict[str, bool]:
     """Write formulas as MathML, which browsers show without a script or a font from elsewhere."""
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
     app.connect("autodoc-process-docstring", _bars)
     app.connect("source-read", _elsewhere)
+    app.add_directive("results-table", ResultsTable)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

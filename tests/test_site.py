@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from xml.etree import ElementTree
 
 import pytest
 
 from tests import documents, first_half
+from tests.benchmarks import browser
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -51,6 +55,65 @@ def test_a_page_becomes_cells_in_its_order() -> None:
         "See [it](../docs/tutorial/../y.md):",
         "!lagros bench z",
     ]
+
+
+def test_the_tables_of_results_say_what_the_rows_say() -> None:
+    """Of the cart-pole's table, in the README and on the page of results."""
+    rows = json.loads((ROOT / "benchmarks/results/cartpole_grid.json").read_text(encoding="utf-8"))
+    kinds = ("uniform", "constant", "gust", "switching")
+    of = {(row["policy"], row["disturbance"]): row for row in rows if row["bound"] == 0.75}
+    for page in (ROOT / "README.md", DOCS / "results.md"):
+        lines = re.findall(r"^\| (?:\(\S+\) )?(\S+) \| (\d.*) \|$", page.read_text("utf-8"), re.M)
+        told = {name: cells.split(" | ") for name, cells in lines if (name, "gust") in of}
+        assert len(told) >= 6, page
+        for name, cells in told.items():
+            strict = [f"{100 * of[name, kind]['strict_success_rate']:.1f}" for kind in kinds]
+            effort = f"{of[name, 'uniform']['effort_mean']:.1f}"
+            assert cells[:5] == [*strict, effort], (page.name, name)
+
+
+def test_every_published_row_is_in_the_table_once_and_filters_start_from_a_plain_table() -> None:
+    results = script("results")
+    found = results.rows()
+    keys = [tuple(column.text(row) for column in results.COLUMNS[:5]) for row in found]
+    channels = [row["channels"] for row in found]
+    assert len(set(zip(keys, channels, strict=True))) == len(keys)
+    assert {row["task"] for row in found} >= {"cartpole", "car", "spacecraft"}
+    # What the files hold, counted another way.
+    grid = json.loads((ROOT / "benchmarks/results/cartpole_grid.json").read_text("utf-8"))
+    of_grid = {(row["policy"], row["disturbance"], row["bound"]) for row in grid}
+    assert of_grid <= {(row["policy"], row["disturbance"], row["bound"]) for row in found}
+    parsed = ElementTree.fromstring(results.page(found))
+    assert len(parsed.findall(".//tbody/tr")) == len(found)
+    assert len(parsed.findall(".//th")) == len(parsed.find(".//tbody/tr"))
+    assert results.markdown(found).count("\n") == len(found) + 1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(browser.PROGRAM is None, reason=browser.MISSING)
+def test_the_table_of_results_filters_and_sorts_in_a_browser(tmp_path: Path) -> None:
+    results = script("results")
+    found = results.rows()
+    code = (DOCS / "_static" / "filter.js").read_text(encoding="utf-8")
+    page = tmp_path / "page.html"
+    page.write_text(
+        f'<meta charset="utf-8">{results.page(found)}<script>{code}</script>', encoding="utf-8"
+    )
+    shown = "[...document.querySelectorAll('tbody tr')].filter((row) => !row.hidden)"
+    with browser.Browser(tmp_path / "browser") as view:
+        view.open(page)
+        assert view.value(f"{shown}.length") == len(found)
+        view.value(
+            "(() => { const choice = document.querySelector('select'); choice.value = 'car';"
+            " choice.dispatchEvent(new Event('change')); })()"
+        )
+        cars = [row for row in found if row["task"] == "car"]
+        assert view.value(f"{shown}.length") == len(cars) > 0
+        view.value("document.querySelectorAll('thead button')[6].click()")
+        sorted_now = view.value(f"{shown}.map((row) => parseFloat(row.cells[6].textContent))")
+        assert sorted_now == sorted(sorted_now)
+        assert sorted_now[-1] == 100.0
+        assert view.problems == []
 
 
 @pytest.mark.slow

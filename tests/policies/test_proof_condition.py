@@ -238,7 +238,7 @@ def test_other_systems_are_refused(proved):
 def test_the_shipped_proof_can_be_made_again(system, proved):
     found = prove_contraction(system, proved, PROVED_BOX, most_seconds=300.0)
     assert found.proved
-    # Figures of docs/certificates.md.
+    # Figures of benchmarks/studies/proofs.md.
     assert found.boxes < 2000
     # Sampling with an optimiser finds 0.55498 1/s to be the largest rate, at a vertex of the box.
     assert prove_contraction(system, proved, PROVED_BOX, 0.5549, most_seconds=300.0).proved
