@@ -295,7 +295,10 @@ def invoke(tmp_path, monkeypatch):
         (("--agents", "6,six"), "--agents: 'six' is not a whole number"),
         (("--agents", "0"), "agents=0 must be a whole number"),
         (("--safety-filter", "yes"), "Valid: none, all, both"),
-        (("--policies", "lqr"), "Valid: learned, tube-mpc, tube-mpc:gain, lagros, centralized"),
+        (
+            ("--policies", "lqr"),
+            "Valid: learned, tube-mpc, tube-mpc:least-norm, lagros, centralized",
+        ),
         (("--disturbance", "worst"), "'worst' pushes away"),
         (("--replan-every", "2"), "--replan-every is for one body"),
         (("--scene", "s.gif"), "must end in .png"),

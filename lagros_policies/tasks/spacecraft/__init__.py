@@ -9,7 +9,7 @@ from typing import Any
 POLICIES = {
     "learned": "lagros_policies.tasks.spacecraft.network_policy:SpacecraftLearnedPolicy",
     "tube-mpc": "lagros_policies.tasks.spacecraft.distributed:DistributedTubeMpcPolicy",
-    "tube-mpc:gain": "lagros_policies.tasks.spacecraft.distributed:GainTubeMpcPolicy",
+    "tube-mpc:least-norm": "lagros_policies.tasks.spacecraft.distributed:LeastNormTubeMpcPolicy",
     "lagros": "lagros_policies.tasks.spacecraft.network_policy:SpacecraftLagrosPolicy",
     "centralized": "lagros_policies.tasks.spacecraft.centralized:CentralizedPolicy",
     "centralized:firm": "lagros_policies.tasks.spacecraft.centralized:FirmCentralizedPolicy",

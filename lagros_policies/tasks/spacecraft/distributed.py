@@ -126,7 +126,7 @@ class DistributedTubeMpcPolicy(BasePolicy):
 
     name = "tube-mpc"
     prepared = True  # `policy.make` tells it the bound of the environment's disturbance
-    own_law: ClassVar[str] = "least-norm"
+    own_law: ClassVar[str] = "gain"
 
     def __init__(
         self,
@@ -316,8 +316,8 @@ class DistributedTubeMpcPolicy(BasePolicy):
         )
 
 
-class GainTubeMpcPolicy(DistributedTubeMpcPolicy):
-    """The same with the gain that belongs to the metric of that rate."""
+class LeastNormTubeMpcPolicy(DistributedTubeMpcPolicy):
+    """The same with Theorem 2's least-norm u* of the metric of least chi."""
 
-    name = "tube-mpc:gain"
-    own_law = "gain"
+    name = "tube-mpc:least-norm"
+    own_law = "least-norm"
