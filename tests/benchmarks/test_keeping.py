@@ -381,6 +381,6 @@ def test_a_folder_that_cannot_be_written_is_refused(bench, tmp_path):
 
 def test_records_are_kept_with_every_field():
     agent = AgentRecord(
-        True, 1.5, False, True, False, None, 0.1, 0.2, float("nan"), None, True, 0.3
+        True, 1.5, False, True, True, False, None, 0.1, 0.2, float("nan"), None, True, 0.3
     )
     assert same(agent, decode(json.loads(json.dumps(encode(agent)))))

@@ -38,6 +38,7 @@ def agent(success=True, effort=1.0, **changes):
         "success": success,
         "success_time": 10.0 if success else None,
         "strict_success": success,
+        "reached": success,
         "paper_success": success,
         "collided": not success,
         "collision_time": None if success else 5.0,

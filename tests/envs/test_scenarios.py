@@ -1,19 +1,23 @@
 """Scenarios: what the presets promise, files, and refusals."""
 
 import dataclasses
+import hashlib
 import json
 import math
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import ndimage
 
 from lagros_envs.seeding import episode_streams
 from lagros_envs.tasks.spacecraft.placement import most_apart
-from lagros_envs.tasks.spacecraft.reachable import flood, way_exists
+from lagros_envs.tasks.spacecraft.reachable import flood, shut_in, way_exists
 from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Preset, Scenario, preset_named
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings, before_growth, settings_for
 
 
 def drawn(preset, agents=None, seeds=range(25)):
@@ -44,20 +48,21 @@ def scenario(**changes):
 def test_every_preset_samples_what_it_promises(name):
     preset = PRESETS[name]
     for sample in drawn(name):
-        assert sample.num_agents == 6
+        assert sample.num_agents == preset.agents
         assert (sample.agent_radius, sample.core) == (preset.agent_radius, preset.core)
         assert preset.obstacle_count[0] <= len(sample.obstacles) <= preset.obstacle_count[1]
         assert np.all(np.linalg.norm(sample.starts - sample.goals, axis=1) >= preset.least_way)
         room = 2.0 * (sample.agent_radius + preset.margin)
         assert np.all(apart(sample.starts) >= room - 1e-12)
         assert np.all(apart(sample.goals) >= room - 1e-12)
-        clearance = preset.obstacle_radius + sample.core + preset.margin
+        clearance = sample.obstacle_radii + sample.core + preset.aside
         for ends in (sample.starts, sample.goals):
-            assert np.all(apart(ends, sample.obstacles) >= clearance)
+            assert np.all(apart(ends, sample.obstacles) >= clearance - 1e-12)
             assert np.all((ends >= 0.0) & (ends <= preset.arena))
         assert np.all((sample.obstacles >= 0.0) & (sample.obstacles <= preset.arena))
         # An agent with its margin fits between any two obstacles.
-        if len(sample.obstacles) > 1:
+        if len(sample.obstacles) > 1 and preset.open_passages:
+            clearance = preset.obstacle_radius + sample.core + preset.margin
             assert np.min(apart(sample.obstacles)) >= 2.0 * clearance
         assert np.all(np.abs(sample.headings) <= preset.heading_range)
 
@@ -98,6 +103,166 @@ def test_a_swarm_grows_at_its_density(agents):
     assert sample.num_agents == agents
     assert np.min(apart(sample.starts), initial=9.0) >= 0.8
     assert np.max(sample.starts) <= preset.arena
+
+
+# SHA-256 of forty scenarios each as the preset `swarm` drew them when it had 45 s for any number.
+FORMER_SWARMS = {
+    1: "808c2f178018f40a",
+    6: "4aaed15518761b82",
+    12: "a3a5552f04d93462",
+    32: "ca7bb85e2f5f2a78",
+}
+
+
+@pytest.mark.parametrize("agents", FORMER_SWARMS)
+def test_swarm_45_is_the_former_swarm_to_the_bit(agents):
+    digest = hashlib.sha256()
+    for sample in drawn("swarm-45", agents, range(40)):
+        digest.update(json.dumps(sample.to_dict()).encode())
+    assert digest.hexdigest().startswith(FORMER_SWARMS[agents])
+    task = settings_for(PRESETS["swarm-45"].for_agents(agents))
+    assert task == SpacecraftSettings()
+    assert (task.horizon, task.time_limit) == (30.0, 45.0)
+
+
+@pytest.mark.parametrize("name", ["swarm", "gcbf"])
+@pytest.mark.parametrize("agents", [1, 8, 32, 1024])
+def test_time_grows_with_the_ways(name, agents):
+    own, preset = PRESETS[name], PRESETS[name].for_agents(agents)
+    task, usual = settings_for(preset), settings_for(own)
+    side = preset.arena / own.arena
+    for duration, before in (
+        (task.horizon, usual.horizon),
+        (task.time_limit, usual.time_limit),
+    ):
+        assert side * before - 1e-6 <= duration < side * before + 0.1
+    assert before_growth(task, preset) == usual
+    # Who says otherwise is heard.
+    assert settings_for(preset, {"time_limit": 50.0}).time_limit == 50.0
+    assert settings_for(preset, usual) is usual
+    assert before_growth(replace(task, horizon=20.0), preset).horizon == 20.0
+
+
+def test_the_task_of_gcbf_is_its_double_integrator_five_times_as_large_and_slow():
+    """Against the defaults of its repository: `env/double_integrator.py` and `env/__init__.py`."""
+    radius, sensing, mass, force, speed, period, steps, side = (
+        0.05,
+        0.5,
+        0.1,
+        1.0,
+        0.5,
+        0.03,
+        256,
+        4,
+    )
+    for agents in (8, 32, 1024):
+        preset = PRESETS["gcbf"].for_agents(agents)
+        task = settings_for(preset)
+        assert preset.arena == pytest.approx(5.0 * math.sqrt(2.0 * agents))
+        assert preset.obstacle_count == (agents, agents)
+        assert preset.agent_radius == preset.core == pytest.approx(5.0 * radius)
+        assert 2.0 * (preset.agent_radius + preset.margin) == pytest.approx(5.0 * 4.0 * radius)
+        assert preset.core + preset.aside == pytest.approx(5.0 * 4.0 * radius)
+        assert task.goal_radius == pytest.approx(5.0 * 2.0 * radius)
+        assert task.sensing_radius == pytest.approx(5.0 * sensing)
+        assert task.speed_limit == pytest.approx(5.0 * speed / 5.0)
+        thrust = 2.0 * task.thrust_limit / task.system.mass
+        assert thrust == pytest.approx(5.0 * force / mass / 5.0**2)
+        share = preset.arena / (5.0 * side)
+        assert task.time_limit == pytest.approx(5.0 * steps * period * share, abs=0.1)
+    assert PRESETS["gcbf-free"].for_agents(64).obstacle_count == (0, 0)
+    # The area of its rectangles: both sides uniform from 0.1 to 0.5.
+    radii = np.concatenate([sample.obstacle_radii for sample in drawn("gcbf", 32, range(40))])
+    assert np.mean(math.pi * radii**2) == pytest.approx((5.0 * 0.3) ** 2, rel=0.05)
+    assert np.min(math.sqrt(math.pi) * radii) >= 5.0 * 0.1
+    assert np.max(math.sqrt(math.pi) * radii) <= 5.0 * 0.5
+
+
+def cut_off(points, apart, centres, radii, cell):
+    """Who is not connected to the outside among the others, one by one, with SciPy's labels."""
+    corners = np.concatenate([points, centres - radii[:, None], centres + radii[:, None]])
+    low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
+    x, y = (np.arange(a, b, cell) for a, b in zip(low, high, strict=True))
+    across, along = np.meshgrid(x, y, indexing="ij")
+    cells = np.stack([across.ravel(), along.ravel()], axis=-1)
+    obstacles = np.all(np.linalg.norm(cells[:, None] - centres, axis=-1) >= radii, axis=1)
+    near = np.linalg.norm(cells[:, None] - points, axis=-1)
+    found = []
+    for agent in range(len(points)):
+        free = obstacles & np.all(np.delete(near, agent, axis=1) >= apart, axis=1)
+        labels, _ = ndimage.label(free.reshape(across.shape))
+        found.append(labels.ravel()[np.argmin(near[:, agent])] != labels[0, 0])
+    return np.array(found)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_who_is_shut_in_by_the_others_is_found(seed):
+    """Rings of parked bodies with and without a gap, bodies that do no harm, and obstacles."""
+    rng = np.random.default_rng(seed)
+    angles = 2.0 * math.pi * np.arange(9) / 9
+    ring = 1.0 * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    ring = ring if seed % 3 else ring[:7]
+    far = np.array([4.0, 0.0]) + rng.uniform(0.0, 3.0, (30, 2))
+    kept = [np.zeros(2), *ring]
+    for point in far:
+        if np.min(np.linalg.norm(np.array(kept) - point, axis=1)) > 0.62:
+            kept.append(point)
+    points = np.array(kept)
+    centres, radii = np.array([[5.5, 1.5], [-3.0, 0.0]]), np.array([0.4, 0.7])
+    points = points[np.all(np.linalg.norm(points[:, None] - centres, axis=-1) > radii + 0.1, 1)]
+    found = shut_in(points, 0.5, centres, radii, 0.05)
+    truth = cut_off(points, 0.5, centres, radii, 0.05)
+    # Never is someone let go who is shut in; a gap narrower than the cells may be missed.
+    assert np.all(found | ~truth)
+    assert found[0] == bool(seed % 3)
+    assert np.count_nonzero(found ^ truth) <= 1
+
+
+@pytest.mark.parametrize(("name", "agents"), [("swarm", 40), ("gcbf", 24)])
+def test_every_goal_can_be_reached_when_the_others_are_parked(name, agents):
+    preset = PRESETS[name]
+    for sample in drawn(name, agents, range(2)):
+        blocked = sample.obstacle_radii + sample.core
+        for points in (sample.starts, sample.goals):
+            cell = 0.1 if name == "swarm" else 0.2
+            assert not cut_off(points, 0.5, sample.obstacles, blocked, cell).any()
+    assert preset.parked
+
+
+def test_who_is_shut_in_is_placed_anew_and_nobody_else():
+    """At a density at which some are, which the plain draws do not see."""
+    crowded = dataclasses.replace(
+        PRESETS["swarm-45"],
+        agents=100,
+        arena=13.0,
+        margin=0.1,
+        obstacle_count=(12, 12),
+        grows=False,
+    )
+    changed = 0
+    for seed in range(6):
+        plain = crowded.sample(np.random.default_rng(seed))
+        parked = dataclasses.replace(crowded, parked=True).sample(np.random.default_rng(seed))
+        moved = np.any((plain.starts != parked.starts) | (plain.goals != parked.goals), axis=1)
+        blocked = plain.obstacle_radii + plain.core
+        shut = shut_in(plain.starts, 0.5, plain.obstacles, blocked, 0.15)
+        shut |= shut_in(plain.goals, 0.5, plain.obstacles, blocked, 0.15)
+        assert moved[shut].all()
+        assert moved.any() == shut.any()
+        changed += int(moved.sum())
+    assert changed
+
+
+def test_drawing_a_thousand_ends():
+    for name in ("swarm", "gcbf", "gcbf-free"):
+        (sample,) = drawn(name, 1024, [5])
+        assert sample.num_agents == 1024
+    # Where everybody is shut in by the obstacles, drawing ends, too, and says so.
+    walls = dataclasses.replace(
+        PRESETS["gcbf"], agents=2, arena=6.0, obstacle_count=(60, 60), grows=False
+    )
+    with pytest.raises(ValueError, match="no scenario with 2 agents"):
+        walls.sample(np.random.default_rng(0))
 
 
 def test_every_sample_has_ways_around_the_inflated_obstacles():

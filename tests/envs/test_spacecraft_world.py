@@ -248,6 +248,28 @@ def test_a_world_ends_when_all_have_collided_or_at_the_limit():
     assert some.time[0] == pytest.approx(45.0)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_no_axis_goes_faster_than_the_speed_limit(seed):
+    """Against very small steps of a point whose speed is cut along each axis, as GCBF+ cuts it."""
+    limit, period, fine = 0.5, 0.1, 400
+    rng = np.random.default_rng(seed)
+    world = begun(scene([[0.0, 0.0], [9.0, 0.0]]), [[0.45, -0.48], [0.1, 0.3]], speed_limit=limit)
+    places, speeds = world.states[0, :, :2], world.states[0, :, 3:5]
+    for _ in range(25):
+        forces = rng.uniform(0.0, 1.0, (1, 2, 8))
+        # Of each pair of pairs the same torque: the body keeps its heading, zero.
+        forces[..., [1, 3, 5, 7]] = forces[..., [0, 2, 4, 6]]
+        world.step(forces)
+        wrench = np.moveaxis(np.array(Spacecraft().wrench(list(forces[0].T)))[:2], 0, -1)
+        for _ in range(fine):
+            faster = np.clip(speeds + wrench * period / fine, -limit, limit)
+            places = places + 0.5 * (speeds + faster) * period / fine
+            speeds = faster
+        np.testing.assert_allclose(world.states[0, :, :2], places, atol=1e-4)
+        np.testing.assert_allclose(world.states[0, :, 3:5], speeds, atol=1e-9)
+        assert np.max(np.abs(world.states[0, :, 3:5])) <= limit
+
+
 def test_a_thrust_too_large_to_integrate_is_a_collision_of_that_agent_alone():
     world = begun(scene([[0.0, 0.0], [3.0, 0.0]]))
     actions = np.zeros((1, 2, 8))
@@ -367,6 +389,7 @@ def test_thrusters_cannot_pull_and_a_limit_clips():
         ({"time_limit": 45.05}, "time_limit=45.05 must be a whole number"),
         ({"sensing_radius": -1.0}, "sensing_radius=-1.0"),
         ({"thrust_limit": 0.0}, "thrust_limit=0.0"),
+        ({"speed_limit": 0.0}, "speed_limit=0.0"),
         ({"effort_weight": math.nan}, "effort_weight=nan"),
     ],
 )

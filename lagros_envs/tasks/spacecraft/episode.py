@@ -17,7 +17,6 @@ from lagros_envs.conventions import (
     End,
     check_started,
     plain_seed,
-    settings_of,
     warned_after,
 )
 from lagros_envs.disturbances import Disturbance, channel_mask
@@ -38,6 +37,7 @@ class SpacecraftEpisode:
         num_agents: Number of agents; None for the preset's own.
         worlds: Number of worlds.
         compiled: As in `SpacecraftWorld`.
+        max_cycles: As in `SpacecraftParallelEnv`.
 
     Raises:
         ValueError: A setting is not valid.
@@ -54,9 +54,10 @@ class SpacecraftEpisode:
         settings: task.SpacecraftSettings | Mapping[str, Any] | None,
         worlds: int = 1,
         compiled: bool | None = False,
+        max_cycles: int | None = None,
     ) -> None:
-        self.settings = settings_of(task.SpacecraftSettings(), settings)
         self.preset = preset_named(preset).for_agents(num_agents)
+        self.settings = task.limited(task.settings_for(self.preset, settings), max_cycles)
         self.disturbance = Disturbance(
             disturbance, disturbance_bound, channel_mask(disturbance_channels, task.RATES), metric
         )

@@ -14,7 +14,6 @@ from lagros_envs.arrays import Float32Array, FloatArray
 from lagros_envs.conventions import (
     RENDER_MODES,
     check_render_mode,
-    settings_of,
 )
 from lagros_envs.options import checked_actions
 from lagros_envs.tasks.spacecraft import task
@@ -72,7 +71,8 @@ class SpacecraftParallelEnv(OneWorld, ParallelEnv[str, Float32Array, Float32Arra
     it was.
 
     ## Episode end
-    `truncated` for all agents at 45 s, `terminated` for all as soon as all have collided. Arriving
+    `truncated` for all agents at `settings.time_limit` (45 s, more where the preset says so),
+    `terminated` for all as soon as all have collided. Arriving
     ends nothing: agents keep station and stay obstacles to others. Nor does one collision: agents
     pass through what they hit, and it is counted. Collisions are found between control steps, too.
     A thrust too large to integrate leaves the state as it was and counts as a collision.
@@ -81,11 +81,12 @@ class SpacecraftParallelEnv(OneWorld, ParallelEnv[str, Float32Array, Float32Arra
     For each agent `success` (it came within `settings.goal_radius` of its goal at a control instant
     before any collision of its own), `is_success` (the same, by the name that other libraries
     read), `success_time` [s] (inf before), `strict_success` (it is there now and has never
-    collided; at the end this is the strict measure), `paper_success` and its time (||(p - p_f, v)||
-    <= r(t) of the published tube before any collision), `collided`,
-    `collision_time`, `effort` (the integral of ||u||^2 so far), `effort_to_success` (the same,
-    frozen at the first success), `disturbance` (d of the step), `tube_radius` r(t), `goal_distance`
-    and, where the episode has a nominal, `tracking_error` ||x - x_d||.
+    collided; at the end this is the strict measure), `reached` (it came there, collided or not),
+    `paper_success` and its time (||(p - p_f, v)|| <= r(t) of the published tube before any
+    collision), `collided`, `collision_time`, `effort` (the integral of ||u||^2 so far),
+    `effort_to_success` (the same, frozen at the first success), `disturbance` (d of the step),
+    `tube_radius` r(t), `goal_distance` and, where the episode has a nominal, `tracking_error`
+    ||x - x_d||.
 
     Args:
         num_agents: Number of agents; None for the preset's own.
@@ -97,7 +98,7 @@ class SpacecraftParallelEnv(OneWorld, ParallelEnv[str, Float32Array, Float32Arra
         disturbance_channels: "all", "rates", or a mask of the six states.
         metric: Contraction metric M for the kind "worst": (6, 6), or a function of the state.
         settings: The task: a `SpacecraftSettings`, or a dictionary of those fields that differ from
-            the defaults.
+            those of the preset; None for the preset's (`task.settings_for`).
         max_cycles: Control steps of an episode, in place of `settings.time_limit`.
         render_mode: None, "human" or "rgb_array".
 
@@ -126,7 +127,6 @@ class SpacecraftParallelEnv(OneWorld, ParallelEnv[str, Float32Array, Float32Arra
         render_mode: str | None = None,
     ) -> None:
         self.render_mode = check_render_mode(render_mode)
-        settings = task.limited(settings_of(task.SpacecraftSettings(), settings), max_cycles)
         self.episode = SpacecraftEpisode(
             num_agents,
             preset,
@@ -135,6 +135,7 @@ class SpacecraftParallelEnv(OneWorld, ParallelEnv[str, Float32Array, Float32Arra
             disturbance_channels,
             metric,
             settings,
+            max_cycles=max_cycles,
         )
         self.settings, self.preset = self.episode.settings, self.episode.preset
         self.disturbance = self.episode.disturbance

@@ -53,53 +53,79 @@ def scatter(rng: np.random.Generator, arena: float, count: int, apart: float) ->
     return placed
 
 
-def scatter_pairs(
-    rng: np.random.Generator,
-    arena: float,
-    count: int,
-    apart: float,
-    least_way: float,
-    obstacles: FloatArray,
-    clearance: float,
-) -> tuple[FloatArray, FloatArray] | None:
-    """Place starts and goals one pair after the other, uniformly in a square.
+class Room:
+    """Where pairs of a start and a goal find a place, uniformly in a square.
 
     Args:
-        rng: Source of the draws.
         arena: Side of the square [m].
-        count: n, pairs.
         apart: Least distance between two starts, and between two goals [m].
         least_way: Least distance from a start to its goal [m].
         obstacles: Centres, shape (k, 2) [m].
-        clearance: Least distance from a centre [m].
-
-    Returns:
-        Starts and goals, each (n, 2); None where one found no place in all of its draws.
+        clearance: Least distance from each centre, shape (k,) [m].
     """
-    first = len(obstacles)
-    # Starts and goals side by side, after the obstacles, with the squares of what they keep.
-    placed = np.empty((first + count, 4))
-    placed[:first] = np.tile(obstacles, 2)
-    squares = np.full(first + count, apart**2)
-    squares[:first] = clearance**2
-    for agent in range(first, first + count):
+
+    def __init__(
+        self,
+        arena: float,
+        apart: float,
+        least_way: float,
+        obstacles: FloatArray,
+        clearance: FloatArray,
+    ) -> None:
+        self.arena, self.apart, self.least_way = arena, apart, least_way
+        self.obstacles, self.clearance = obstacles, clearance
+
+    def scatter(self, rng: np.random.Generator, count: int) -> FloatArray | None:
+        """Place pairs one after the other.
+
+        Args:
+            rng: Source of the draws.
+            count: n, pairs.
+
+        Returns:
+            Starts and goals side by side, (n, 4); None where one found no place in its draws.
+        """
+        first = len(self.obstacles)
+        placed, squares = self._kept(count)
+        for agent in range(first, first + count):
+            pair = self._pair(rng, placed[:agent], squares[:agent])
+            if pair is None:
+                return None
+            placed[agent] = pair
+        return placed[first:]
+
+    def place(self, rng: np.random.Generator, others: FloatArray) -> FloatArray | None:
+        """Place one pair among others (n, 4); return it, (4,), or None as `scatter` does."""
+        placed, squares = self._kept(len(others))
+        placed[len(self.obstacles) :] = others
+        return self._pair(rng, placed, squares)
+
+    def _kept(self, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return the obstacles with room for pairs after them, and the squares of what to keep."""
+        first = len(self.obstacles)
+        placed = np.empty((first + count, 4))
+        placed[:first] = np.tile(self.obstacles, 2)
+        squares = np.full(first + count, self.apart**2)
+        squares[:first] = self.clearance**2
+        return placed, squares
+
+    def _pair(
+        self, rng: np.random.Generator, placed: FloatArray, squares: FloatArray
+    ) -> FloatArray | None:
         for _ in range(ROUNDS):
-            draws = rng.uniform(0.0, arena, (2, DRAWS, 2))
+            draws = rng.uniform(0.0, self.arena, (2, DRAWS, 2))
             way = draws[0] - draws[1]
-            far = np.flatnonzero(_square(way[:, 0], way[:, 1]) >= least_way**2)
+            far = np.flatnonzero(_square(way[:, 0], way[:, 1]) >= self.least_way**2)
             ends = np.concatenate([draws[0, far], draws[1, far]], axis=1)
-            fits = _first_clear(ends, placed[:agent], squares[:agent])
+            fits = _first_clear(ends, placed, squares)
             if fits is not None:
-                placed[agent] = ends[fits]
-                break
-        else:
-            return None
-    starts, goals = placed[first:, :2].copy(), placed[first:, 2:].copy()
-    return starts, goals
+                found: FloatArray = ends[fits]
+                return found
+        return None
 
 
-def clear(points: FloatArray, others: FloatArray, distance: float) -> BoolArray:
-    """Tell which points (p, 2) keep the distance to all the others (q, 2)."""
+def clear(points: FloatArray, others: FloatArray, distance: FloatArray) -> BoolArray:
+    """Tell which points (p, 2) keep the distances (q,) to all the others (q, 2)."""
     return _clear_squares(points, others, distance**2)
 
 

@@ -2,183 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
 from lagros_envs.arrays import FloatArray
-from lagros_envs.checks import (
-    check_fields,
-    check_not_negative,
-    check_positive,
-    check_whole,
-    shown,
-    suggestion,
-)
+from lagros_envs.checks import check_fields, check_not_negative, check_whole, shown, suggestion
 from lagros_envs.conventions import built_like
-from lagros_envs.files import write_atomic
-from lagros_envs.options import real_numbers
-from lagros_envs.reading import Record
-from lagros_envs.tasks.spacecraft.placement import clear, most_apart, scatter, scatter_pairs
-from lagros_envs.tasks.spacecraft.reachable import way_exists
-from lagros_envs.values import ByValue, use_plain_numbers
+from lagros_envs.tasks.spacecraft.placement import Room, clear, most_apart, scatter
+from lagros_envs.tasks.spacecraft.reachable import shut_in, way_exists
+from lagros_envs.tasks.spacecraft.scenario import LARGEST, MOST_AGENTS, MOST_OBSTACLES, Scenario
+from lagros_envs.values import use_plain_numbers
 
-FORMAT = "lagros-scenario-1"
+__all__ = ["MOST_AGENTS", "PRESETS", "Preset", "Scenario", "preset_named"]
+
 ATTEMPTS = 1000  # of a whole scenario, before the density is called impossible
-# Of a coordinate and a radius [m]: planners look for ways in time, and no thruster gets farther.
-LARGEST = 1e4
-MOST_AGENTS, MOST_OBSTACLES = 1000, 10_000  # all pairs of them are looked at
+REPAIRS = 50  # of an attempt in which agents shut in others
 GRID = 0.15  # cell of the grid on which a way is looked for [m]
-# Shapes of a scenario's arrays, for n agents and k obstacles.
-_SHAPES: dict[str, tuple[Any, ...]] = {
-    "starts": ("n", 2),
-    "headings": ("n",),
-    "goals": ("n", 2),
-    "obstacles": ("k", 2),
-    "obstacle_radii": ("k",),
-}
-
-
-@dataclass(frozen=True, eq=False)
-class Scenario(ByValue):
-    """One task: who starts where, wants to go where, and what stands in between.
-
-    Attributes:
-        starts: Positions at the start, shape (n, 2) [m]; every agent starts at rest.
-        headings: phi at the start, shape (n,) [rad].
-        goals: Positions to reach, shape (n, 2) [m].
-        obstacles: Centres, shape (k, 2) [m].
-        obstacle_radii: Shape (k,) [m].
-        agent_radius: Two agents collide when their centres come closer than twice this [m].
-        core_radius: An agent collides with an obstacle when its centre comes closer to the
-            obstacle's rim than this [m]; None takes `agent_radius`.
-
-    Raises:
-        ValueError: A shape is wrong, a value is not finite, a radius is out of range, or agents
-            start in collision.
-    """
-
-    starts: FloatArray
-    headings: FloatArray
-    goals: FloatArray
-    obstacles: FloatArray
-    obstacle_radii: FloatArray
-    agent_radius: float = 0.25
-    core_radius: float | None = None
-
-    def __post_init__(self) -> None:
-        """Take read-only copies in double precision and check them."""
-        arrays = {name: _numbers(name, getattr(self, name)) for name in _SHAPES}
-        sizes = {"n": arrays["starts"].shape[:1], "k": arrays["obstacle_radii"].shape[:1]}
-        for name, (whose, *rest) in _SHAPES.items():
-            value, shape = arrays[name], (*sizes[whose], *rest)
-            if value.size == 0:
-                value = value.reshape(shape if 0 in shape else value.shape)
-            if value.shape != shape or not np.all(np.abs(value) <= LARGEST):
-                raise ValueError(
-                    f"{name} has shape {value.shape}; it must be finite, at most {LARGEST:g}, and "
-                    f"of shape {shape}, for {len(arrays['starts'])} agents and "
-                    f"{arrays['obstacle_radii'].size} obstacles"
-                )
-            value.flags.writeable = False
-            object.__setattr__(self, name, value)
-        check_whole("agents", self.num_agents, 1, MOST_AGENTS)
-        check_whole("obstacles", len(self.obstacles), 0, MOST_OBSTACLES)
-        check_positive("agent_radius", self.agent_radius)
-        if self.core_radius is None:
-            object.__setattr__(self, "core_radius", self.agent_radius)
-        check_not_negative("core_radius", self.core, "or None for agent_radius")
-        if np.any(self.obstacle_radii <= 0.0):
-            raise ValueError(f"obstacle_radii={self.obstacle_radii.tolist()} must be > 0")
-        self._check_starts()
-
-    @classmethod
-    def placed(cls, *values: FloatArray | float) -> Scenario:
-        """Return the scenario of these fields without a check, for who has just placed them.
-
-        Args:
-            values: All fields in their order; the arrays become the scenario's own, read-only.
-        """
-        scenario = object.__new__(cls)
-        for item, value in zip(fields(cls), values, strict=True):
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
-            object.__setattr__(scenario, item.name, value)
-        return scenario
-
-    @property
-    def num_agents(self) -> int:
-        """Number n of agents."""
-        return len(self.starts)
-
-    @property
-    def core(self) -> float:
-        """The agents' radius against obstacles [m]."""
-        return self.agent_radius if self.core_radius is None else self.core_radius
-
-    def _check_starts(self) -> None:
-        apart = np.linalg.norm(self.starts[:, None] - self.starts, axis=-1)
-        np.fill_diagonal(apart, np.inf)
-        first, second = np.unravel_index(np.argmin(apart), apart.shape)
-        if apart[first, second] < 2.0 * self.agent_radius:
-            raise ValueError(
-                f"agents {first} and {second} start {apart[first, second]:.3f} m apart; they need "
-                f"{2.0 * self.agent_radius:g} m"
-            )
-        gaps = np.linalg.norm(self.starts[:, None] - self.obstacles, axis=-1) - self.obstacle_radii
-        agents, obstacles = np.nonzero(gaps < self.core)
-        if agents.size:
-            raise ValueError(
-                f"agent {agents[0]} starts {gaps[agents[0], obstacles[0]]:.3f} m from the rim of "
-                f"obstacle {obstacles[0]}; it needs {self.core:g} m"
-            )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the scenario as plain numbers and lists."""
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in values.items()
-        }
-
-    def save(self, path: str | Path) -> None:
-        """Write the scenario as JSON, atomically; numbers keep every bit."""
-        write_atomic(path, json.dumps({"format": FORMAT, **self.to_dict()}, indent=1) + "\n")
-
-    @classmethod
-    def load(cls, path: str | Path) -> Scenario:
-        """Read a scenario that `save` has written.
-
-        Raises:
-            FileNotFoundError: There is no such file.
-            ValueError: The file is not a scenario, or describes one that cannot be.
-        """
-        record = Record.load(path, "a scenario")
-        record.must("format", FORMAT)
-        record.only(["format", *(item.name for item in fields(cls))])
-        core = record["core_radius"]
-        try:
-            return cls(
-                **{name: record.array(name, (None, *rest)) for name, (_, *rest) in _SHAPES.items()},
-                agent_radius=record.number("agent_radius"),
-                core_radius=None if core is None else record.number("core_radius"),
-            )
-        except ValueError as error:
-            text = str(error)
-            raise ValueError(text if record.name in text else f"{record.name}: {text}") from None
-
-
-def _numbers(name: str, value: Any) -> FloatArray:
-    """Return a copy of an array of real numbers, or refuse what is none."""
-    array = real_numbers(value)
-    if array is None:
-        raise ValueError(f"{name}={shown(value)} must be numbers in lists of equal lengths")
-    return array
 
 
 @dataclass(frozen=True)
@@ -193,12 +36,22 @@ class Preset:
         agent_radius: As in `Scenario` [m].
         core_radius: As in `Scenario` [m].
         margin: Room that every start, goal and passage keeps beside the radii [m].
+        obstacle_margin: The same of starts and goals beside obstacles [m]; None takes `margin`.
         least_way: Least distance from a start to its goal [m].
         heading_range: phi at the start is uniform in plus or minus this [rad].
         open_passages: Whether an agent with its margin fits between any two obstacles.
         layout: "random", or "antipodal": on a circle, each goal opposite to its start.
         grows: Whether arena and obstacle count grow with the number of agents, at the density of
             `agents`.
+        slows: Whether T and the time limit grow with the side of the arena, as the ways do.
+        time_scale: By what T and the time limit of the task are multiplied; `for_agents` sets it.
+        rectangle_sides: Least and largest side of rectangles, both sides uniform, of which each
+            obstacle is the disc of the same area and which may overlap [m]; None for discs of
+            `obstacle_radius`.
+        parked: Whether every start can be left while all others are parked at theirs, and every
+            goal reached while all others are at theirs, by a way from outside of everything.
+        task: Names and values of `SpacecraftSettings` that are other than the paper's; what an
+            environment is given goes before them.
 
     Raises:
         ValueError: A value is out of range.
@@ -211,20 +64,34 @@ class Preset:
     agent_radius: float = 0.25
     core_radius: float | None = None
     margin: float = 0.15
+    obstacle_margin: float | None = None
     least_way: float = 2.5
     heading_range: float = math.pi
     open_passages: bool = True
     layout: Literal["random", "antipodal"] = "random"
     grows: bool = False
+    slows: bool = False
+    time_scale: float = 1.0
+    rectangle_sides: tuple[float, float] | None = None
+    parked: bool = False
+    task: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         check_fields(
             self,
-            positive=("arena", "obstacle_radius", "agent_radius"),
+            positive=("arena", "obstacle_radius", "agent_radius", "time_scale"),
             not_negative=("margin", "least_way", "heading_range"),
         )
         use_plain_numbers(self)
+        if self.rectangle_sides is not None:
+            least, largest = self.rectangle_sides
+            if not 0.0 < least <= largest <= LARGEST:
+                raise ValueError(
+                    f"rectangle_sides={self.rectangle_sides!r} must be 0 < least <= largest <= "
+                    f"{LARGEST:g}, or None for discs of obstacle_radius"
+                )
         check_not_negative("core_radius", self.core, "or None for agent_radius")
+        check_not_negative("obstacle_margin", self.aside, "or None for margin")
         if self.arena > LARGEST:
             raise ValueError(f"arena={self.arena!r} must be at most {LARGEST:g}")
         fewest, most = self.obstacle_count
@@ -240,6 +107,11 @@ class Preset:
         """The agents' radius against obstacles [m]."""
         return self.agent_radius if self.core_radius is None else self.core_radius
 
+    @property
+    def aside(self) -> float:
+        """Room that starts and goals keep beside obstacles [m]."""
+        return self.margin if self.obstacle_margin is None else self.obstacle_margin
+
     def for_agents(self, num_agents: int | None = None) -> Preset:
         """Return the preset with its sizes for this many agents.
 
@@ -253,12 +125,14 @@ class Preset:
             return self if count == self.agents else replace(self, agents=count)
         share = max(1.0, count / self.agents)
         fewest, most = (round(share * number) for number in self.obstacle_count)
+        side = math.sqrt(share)
         return replace(
             self,
             agents=count,
-            arena=self.arena * math.sqrt(share),
+            arena=self.arena * side,
             obstacle_count=(fewest, most),
             grows=False,
+            time_scale=self.time_scale * side if self.slows else self.time_scale,
         )
 
     def sample(self, rng: np.random.Generator, num_agents: int | None = None) -> Scenario:
@@ -309,6 +183,37 @@ class Preset:
             raise self._refusal("(least_way is longer than the diagonal)")
 
 
+# The double integrator of GCBF+ (arXiv 2401.14554, defaults of github.com/MIT-REALM/gcbfplus), with
+# lengths and times five times its own. So speeds stay as they are, 0.5 m/s along each axis, and
+# accelerations become 2 m/s^2 along each axis: two thrusters of 1 N at 1 kg. Its own numbers:
+# radius 0.05, sensing 0.5, arrived within 0.1, starts and goals 0.2 apart and from obstacles,
+# rectangles with sides of 0.1 to 0.5, eight agents in a square of side 4 at its density, 256 steps
+# of 0.03 s in a square of that side, and more in a larger one. T is two thirds of the limit, as in
+# the paper.
+_GCBF = Preset(
+    agents=8,
+    arena=20.0,
+    obstacle_count=(8, 8),
+    obstacle_radius=1.5 / math.sqrt(math.pi),
+    margin=0.25,
+    obstacle_margin=0.75,
+    least_way=0.0,
+    heading_range=0.0,
+    open_passages=False,
+    grows=True,
+    slows=True,
+    rectangle_sides=(0.5, 2.5),
+    parked=True,
+    task=(
+        ("goal_radius", 0.5),
+        ("horizon", 25.6),
+        ("sensing_radius", 2.5),
+        ("speed_limit", 0.5),
+        ("thrust_limit", 1.0),
+        ("time_limit", 38.4),
+    ),
+)
+
 PRESETS: dict[str, Preset] = {
     "paper": Preset(),
     # The authors' released code: centres of agents 1 m apart, agents that are points to obstacles,
@@ -323,7 +228,12 @@ PRESETS: dict[str, Preset] = {
     ),
     "crossing": Preset(obstacle_count=(0, 0), least_way=0.0, layout="antipodal"),
     "open": Preset(obstacle_count=(0, 0)),
-    "swarm": Preset(grows=True),
+    # Ways grow with the side of the arena, and the time for them as well.
+    "swarm": Preset(grows=True, slows=True, parked=True),
+    # However many there are and however long their ways, T = 30 s and 45 s to arrive.
+    "swarm-45": Preset(grows=True),
+    "gcbf": _GCBF,
+    "gcbf-free": replace(_GCBF, obstacle_count=(0, 0)),
 }
 
 
@@ -345,40 +255,75 @@ def preset_named(preset: str | Preset | Mapping[str, Any]) -> Preset:
 
 def _attempt(preset: Preset, rng: np.random.Generator) -> Scenario | None:
     """Draw once; None if something found no place or a goal cannot be reached."""
-    fewest, most = preset.obstacle_count
-    count = int(rng.integers(fewest, most, endpoint=True))
-    passage = preset.core + preset.margin if preset.open_passages else 0.0
-    gap = 2.0 * (preset.obstacle_radius + passage)
-    obstacles = scatter(rng, preset.arena, count, gap)
-    if obstacles is None:
+    found = _obstacles(preset, rng)
+    if found is None:
         return None
-    clearance = preset.obstacle_radius + preset.core + preset.margin
+    obstacles, radii = found
+    clearance = radii + preset.core + preset.aside
+    apart = 2.0 * (preset.agent_radius + preset.margin)
     if preset.layout == "antipodal":
         ends = _opposite_ends(preset, rng)
         if not all(np.all(clear(points, obstacles, clearance)) for points in ends):
             return None
     else:
-        found = scatter_pairs(
-            rng,
-            preset.arena,
-            preset.agents,
-            2.0 * (preset.agent_radius + preset.margin),
-            preset.least_way,
-            obstacles,
-            clearance,
-        )
-        if found is None:
+        room = Room(preset.arena, apart, preset.least_way, obstacles, clearance)
+        pairs = room.scatter(rng, preset.agents)
+        if pairs is not None and preset.parked:
+            pairs = _let_out(preset, rng, room, pairs, radii)
+        if pairs is None:
             return None
-        ends = found
+        ends = pairs[:, :2].copy(), pairs[:, 2:].copy()
     starts, goals = ends
-    inflated = np.full(count, clearance)
-    if not way_exists(starts, goals, obstacles, inflated, GRID):
+    inflated = radii + preset.core + preset.margin
+    if not preset.parked and not way_exists(starts, goals, obstacles, inflated, GRID):
         return None
     headings = preset.heading_range * rng.uniform(-1.0, 1.0, preset.agents)
-    radii = np.full(count, preset.obstacle_radius)
     # What was placed with a margin needs no second look, which takes as long as placing it.
     make = Scenario.placed if preset.margin > 0.0 else Scenario
     return make(starts, headings, goals, obstacles, radii, preset.agent_radius, preset.core)
+
+
+def _obstacles(preset: Preset, rng: np.random.Generator) -> tuple[FloatArray, FloatArray] | None:
+    """Draw centres (k, 2) and radii (k,) of obstacles; None if one found no place."""
+    fewest, most = preset.obstacle_count
+    count = int(rng.integers(fewest, most, endpoint=True))
+    if preset.rectangle_sides is not None:
+        sides = rng.uniform(*preset.rectangle_sides, (2, count))
+        radii = np.sqrt(sides[0] * sides[1] / math.pi)
+        return rng.uniform(0.0, preset.arena, (count, 2)), radii
+    passage = preset.core + preset.margin if preset.open_passages else 0.0
+    gap = 2.0 * (preset.obstacle_radius + passage)
+    centres = scatter(rng, preset.arena, count, gap)
+    return None if centres is None else (centres, np.full(count, preset.obstacle_radius))
+
+
+def _let_out(
+    preset: Preset, rng: np.random.Generator, room: Room, pairs: FloatArray, radii: FloatArray
+) -> FloatArray | None:
+    """Place those anew who are shut in by others that are parked; None if some stay so.
+
+    Args:
+        preset: The preset.
+        rng: Source of the draws.
+        room: Where pairs find a place.
+        pairs: Starts and goals side by side, shape (n, 4) [m].
+        radii: Of the obstacles, shape (k,) [m].
+    """
+    blocked = radii + preset.core
+    for _ in range(REPAIRS):
+        shut = np.zeros(len(pairs), bool)
+        for points in (pairs[:, :2], pairs[:, 2:]):
+            touch = 2.0 * preset.agent_radius
+            shut |= shut_in(points, touch, room.obstacles, blocked, max(GRID, preset.margin))
+        if not shut.any():
+            return pairs
+        for agent in np.flatnonzero(shut):
+            others = np.delete(pairs, agent, axis=0)
+            anew = room.place(rng, others)
+            if anew is None:
+                return None
+            pairs[agent] = anew
+    return None
 
 
 def _opposite_ends(preset: Preset, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:

@@ -5,6 +5,8 @@ Every definition works on arrays of any leading shape, so that one agent and man
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -21,10 +23,11 @@ from lagros_envs.checks import (
     check_positive,
     check_whole,
 )
+from lagros_envs.conventions import settings_of
 from lagros_envs.options import nominal_option
 from lagros_envs.task import Defaults, Described
 from lagros_envs.tasks.spacecraft.physics import Spacecraft
-from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS
+from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS, Preset
 from lagros_envs.tube import PaperTube
 from lagros_envs.values import use_plain_numbers
 
@@ -55,6 +58,8 @@ class SpacecraftSettings(Described):
         goal_radius: Distance from the goal at which an agent has arrived [m].
         tube: The published tube; its radius is the threshold of `paper_success`.
         thrust_scale: Force of the action 1.0 of one thruster [N].
+        speed_limit: Largest speed along each axis of the world [m/s], beyond which nothing pushes;
+            None for none.
         thrust_limit: Saturation of one thruster [N]; None leaves it unlimited, and actions beyond 1
             are applied as they are. Thrusters cannot pull: negative actions count as zero.
         progress_weight: Reward per metre of approach to the goal.
@@ -75,6 +80,7 @@ class SpacecraftSettings(Described):
     tube: PaperTube = field(default_factory=lambda: PaperTube(0.125, 0.3))
     thrust_scale: float = 1.0
     thrust_limit: float | None = None
+    speed_limit: float | None = None
     progress_weight: float = 1.0
     effort_weight: float = 0.02
     success_bonus: float = 5.0
@@ -111,6 +117,8 @@ class SpacecraftSettings(Described):
         if self.thrust_limit is not None:
             check_positive("thrust_limit", self.thrust_limit, "or None for no limit")
             check_at_most("thrust_limit", self.thrust_limit, LARGEST_FORCE, "or None for no limit")
+        if self.speed_limit is not None:
+            check_positive("speed_limit", self.speed_limit, "or None for no limit")
         for name in ("horizon", "time_limit"):
             check_multiple(name, getattr(self, name), "control_period", self.control_period, 1e-6)
 
@@ -118,6 +126,49 @@ class SpacecraftSettings(Described):
     def steps(self) -> int:
         """Control steps of an episode that runs to its limit."""
         return round(self.time_limit / self.control_period)
+
+
+def settings_for(
+    preset: Preset, given: SpacecraftSettings | Mapping[str, Any] | None = None
+) -> SpacecraftSettings:
+    """Return the task of the worlds of a preset.
+
+    Args:
+        preset: The preset, with its number of agents.
+        given: Settings, which are taken as they are; a dictionary of those fields that differ from
+            the preset's; None for the preset's.
+
+    Raises:
+        ValueError: A field is unknown, or a value is out of range.
+    """
+    if isinstance(given, SpacecraftSettings):
+        return given
+    own = settings_of(SpacecraftSettings(), dict(preset.task))
+    return settings_of(_slower(own, preset.time_scale), given)
+
+
+def before_growth(settings: SpacecraftSettings, preset: Preset) -> SpacecraftSettings:
+    """Return the settings with T and the time limit of as few agents as the preset is made for.
+
+    Where they are not those of the preset they stay: somebody has chosen them.
+    """
+    usual = settings_of(SpacecraftSettings(), dict(preset.task))
+    grown = _slower(usual, preset.time_scale)
+    if (settings.horizon, settings.time_limit) != (grown.horizon, grown.time_limit):
+        return settings
+    return replace(settings, horizon=usual.horizon, time_limit=usual.time_limit)
+
+
+def _slower(settings: SpacecraftSettings, scale: float) -> SpacecraftSettings:
+    """Return the settings with T and the time limit times a factor, in whole control periods."""
+    if scale == 1.0:
+        return settings
+    period = settings.control_period
+    horizon, limit = (
+        round(math.ceil(scale * time / period - 1e-6) * period, 9)
+        for time in (settings.horizon, settings.time_limit)
+    )
+    return replace(settings, horizon=horizon, time_limit=limit)
 
 
 def limited(settings: SpacecraftSettings, steps: int | None) -> SpacecraftSettings:

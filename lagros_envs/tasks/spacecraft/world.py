@@ -70,7 +70,7 @@ class SpacecraftWorld:
         self.disturbance, self.settings = disturbance, settings
         self.step_limit = settings.steps
         shape = (worlds, agents)
-        substep = settings.control_period / SUBSTEPS
+        self._substep = substep = settings.control_period / SUBSTEPS
         pushed = disturbance.kind != "none"
         self._hold = HeldBatch(
             settings.system.by_wrench, substep, shape, compiled, 1, pushed=pushed
@@ -101,6 +101,7 @@ class SpacecraftWorld:
         self.success_time = np.full(shape, np.inf)
         self.paper_success_time = np.full(shape, np.inf)
         self.collision_time = np.full(shape, np.inf)
+        self.reached = np.zeros(shape, bool)
         self.push = np.zeros((task.STATE_DIM, *shape))
         self._pushes = np.zeros((worlds, settings.steps, task.STATE_DIM, agents))
         self._everywhere = np.arange(worlds)
@@ -168,6 +169,7 @@ class SpacecraftWorld:
             array[worlds] = 0.0
         for array in (self.success_time, self.paper_success_time, self.collision_time):
             array[worlds] = np.inf
+        self.reached[worlds] = False
         chosen = np.zeros(self.worlds, bool)
         chosen[worlds] = True
         self._note_arrivals(self.goal_distance, chosen[:, None])
@@ -217,6 +219,7 @@ class SpacecraftWorld:
             "is_success": np.isfinite(self.success_time),
             "success_time": self.success_time.copy(),
             "strict_success": (distance <= self.settings.goal_radius) & ~collided,
+            "reached": self.reached.copy(),
             "paper_success": np.isfinite(self.paper_success_time),
             "paper_success_time": self.paper_success_time.copy(),
             "collided": collided,
@@ -300,18 +303,17 @@ class SpacecraftWorld:
     def _advance(self, control: FloatArray) -> tuple[Path, BoolArray]:
         """Move the states over one control step, and tell which could be integrated."""
         wrench = self.settings.system.wrench(list(control))
-        duration = self.settings.control_period / SUBSTEPS
         points = np.empty((SUBSTEPS + 1, 2, self.worlds, self.agents))
         # No turn of the body makes its force longer, and a path whose acceleration is at most a
         # leaves its chord by at most a h^2 / 8.
         acceleration = _length(wrench[0], wrench[1]) / self.settings.system.mass
-        bulge = (acceleration + _length(self.push[3], self.push[4])) * (duration**2 / 8.0)
+        bulge = (acceleration + _length(self.push[3], self.push[4])) * (self._substep**2 / 8.0)
         points[0] = self.parts[:2]
         with np.errstate(over="ignore", invalid="ignore"):
-            parts = self._hold(self.parts, wrench, self.push)
+            parts = self._saturated(self.parts, self._hold(self.parts, wrench, self.push))
             points[1] = parts[:2]
             for substep in range(1, SUBSTEPS):
-                parts = self._hold.go_on(parts)
+                parts = self._saturated(parts, self._hold.go_on(parts))
                 points[substep + 1] = parts[:2]
             integrated = np.all(np.abs(parts) <= task.LARGEST_STATE, axis=0)
         if not integrated.all():
@@ -321,6 +323,26 @@ class SpacecraftWorld:
             bulge = np.where(integrated, bulge, 0.0)
         self.parts = parts.copy()
         return Path.through(points, bulge), integrated
+
+    def _saturated(self, before: FloatArray, after: FloatArray) -> FloatArray:
+        """Return states after a substep as the speed limit leaves them.
+
+        A velocity along an axis that reaches the limit stays there: what it would have gained goes,
+        and the way that it would have covered with it, v_e^2 / 2a of an acceleration a that leads
+        v_e beyond the limit.
+        """
+        limit = self.settings.speed_limit
+        if limit is None:
+            return after
+        parts = after.copy()
+        for place, speed in ((0, 3), (1, 4)):
+            kept = np.clip(after[speed], -limit, limit)
+            beyond = after[speed] - kept
+            gain = after[speed] - before[speed]
+            share = np.divide(beyond, gain, out=np.zeros_like(gain), where=beyond != 0.0)
+            parts[place] -= 0.5 * self._substep * beyond * share
+            parts[speed] = kept
+        return parts
 
     def _note_arrivals(self, distance: FloatArray, worlds: BoolArray | bool = True) -> BoolArray:
         """Record the first arrivals, after the collisions, and return who just arrived.
@@ -332,7 +354,9 @@ class SpacecraftWorld:
         settings, now = self.settings, self.time[:, None]
         eligible = ~self.collided & worlds
         open_ = np.isinf(self.success_time) & worlds
-        first = eligible & open_ & (distance <= settings.goal_radius)
+        there = worlds & (distance <= settings.goal_radius)
+        self.reached = self.reached | there
+        first = eligible & open_ & there
         self.effort_to_success = np.where(open_, self.effort, self.effort_to_success)
         self.success_time = np.where(first, now, self.success_time)
         _, _, _, velocity_x, velocity_y, _ = self.parts

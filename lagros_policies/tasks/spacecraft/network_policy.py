@@ -34,7 +34,7 @@ class SpacecraftActor(BasePolicy):
     Every row of an observation is an agent of its own: all agents of all worlds fit in one call.
 
     Args:
-        settings: The task; None for the paper's.
+        settings: The task; None for that of the preset.
         preset: The preset, or its name: the size of observations and the radii of the bodies.
         num_agents: Number of agents; None for the preset's own.
         weights: A file of the network, or the network itself; None for the shipped one.
@@ -85,7 +85,8 @@ class SpacecraftActor(BasePolicy):
             self.network.metadata,
             what,
             self.recorded_as,
-            self.settings,
+            # Who sees no further than its neighbours is not tied to their number.
+            task.before_growth(self.settings, self.preset),
             spacecraft_range(task.SpacecraftSettings(), self.trained_in),
             allow_other_settings,
             radii_of(self.preset),

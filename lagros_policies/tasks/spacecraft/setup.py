@@ -7,11 +7,10 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from lagros_envs.arrays import FloatArray
-from lagros_envs.conventions import settings_of
 from lagros_envs.tasks.spacecraft.physics import HEADING, SPIN
 from lagros_envs.tasks.spacecraft.scenarios import Preset, preset_named
 from lagros_envs.tasks.spacecraft.sensing import Layout
-from lagros_envs.tasks.spacecraft.task import THRUSTERS, SpacecraftSettings
+from lagros_envs.tasks.spacecraft.task import THRUSTERS, SpacecraftSettings, settings_for
 from lagros_policies.sb3_model import Spaces
 from lagros_policies.trained_for import Range, body_values
 
@@ -32,7 +31,7 @@ def task_and_preset(
     """Return what the first three arguments of every policy of the spacecraft mean.
 
     Args:
-        settings: The task; None for the paper's.
+        settings: The task; None for that of the preset.
         preset: The preset, or its name.
         num_agents: Number of agents; None for the preset's own.
 
@@ -43,10 +42,8 @@ def task_and_preset(
         ValueError: The settings are none, there is no such preset, or the number of agents is less
             than 1.
     """
-    return (
-        settings_of(SpacecraftSettings(), settings),
-        preset_named(preset).for_agents(num_agents),
-    )
+    chosen = preset_named(preset).for_agents(num_agents)
+    return settings_for(chosen, settings), chosen
 
 
 def spaces(task: SpacecraftSettings, preset: str | Preset) -> Spaces:

@@ -29,7 +29,7 @@ from lagros_envs.checks import check_name, check_whole
 from lagros_envs.disturbances import Disturbance
 from lagros_envs.seeding import episode_streams
 from lagros_envs.tasks.spacecraft import task
-from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS
+from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS, preset_named
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 
 # Position and velocity along the first axis of the arena, in the state of a spacecraft.
@@ -48,7 +48,7 @@ class SpacecraftBench:
 
     def __init__(self, settings: Any) -> None:
         self.settings = settings
-        self.task = task.SpacecraftSettings()
+        self.task = task.settings_for(preset_named(settings.preset).for_agents(settings.agents))
         self.shape = (self.task.steps, settings.agents, task.STATE_DIM)
         self._targets: list[SpacecraftTarget] = []
 
@@ -142,7 +142,7 @@ class SpacecraftBench:
 
 def replay_spacecraft(target: SpacecraftTarget, pushes: FloatArray) -> Outcome:
     """Fly one sequence d (steps, agents, 6) in a world of its own."""
-    given = Replay(pushes, task.SpacecraftSettings().control_period)
+    given = Replay(pushes, target.task.control_period)
     with Attempt() as attempt:
         flown = target.fly(target.environment(1, given))
     if attempt.error is not None:
@@ -190,9 +190,9 @@ def search_adversary(
 def _fly_known(target: SpacecraftTarget) -> Found:
     """Fly the sequence that is the worst for the position error of any agent that is tracked."""
     tracking: Any = target.policy.bare.tracking
-    paper = task.SpacecraftSettings()
-    along = worst_plane_pushes(tracking, target.bound, paper.steps)
-    sequence = np.zeros((paper.steps, target.agents, task.STATE_DIM))
+    flown = target.task
+    along = worst_plane_pushes(tracking, target.bound, flown.steps)
+    sequence = np.zeros((flown.steps, target.agents, task.STATE_DIM))
     sequence[..., _PLANE] = along[:, None]
-    given = Replay(target.bound * sequence, paper.control_period)
+    given = Replay(target.bound * sequence, flown.control_period)
     return Found(sequence, float(target.fly(target.environment(1, given)).scores[0]), 1)

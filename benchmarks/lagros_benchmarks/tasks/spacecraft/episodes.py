@@ -25,7 +25,15 @@ from lagros_policies.policy import BasePolicy, as_policy
 # Memories of a policy within those of the filters that it uses.
 _MOST_WRAPPED = 4
 _MEASURES = (
-    *("success", "success_time", "strict_success", "paper_success", "collided", "collision_time"),
+    *(
+        "success",
+        "success_time",
+        "strict_success",
+        "reached",
+        "paper_success",
+        "collided",
+        "collision_time",
+    ),
     *("effort", "effort_to_success", "goal_distance"),
 )
 
@@ -38,6 +46,7 @@ class AgentRecord(Keepable):
         success: It came within the goal radius before the time limit and any collision of its own.
         success_time: t*, when it did [s]; None if it did not.
         strict_success: It was there at the end and never collided.
+        reached: It came within the goal radius before the time limit, collided or not.
         paper_success: ||(p - p_f, v)|| <= r(t) at some control instant before any collision.
         collided: It touched an obstacle or another agent, before or after its success.
         collision_time: When it first did [s]; None if it did not.
@@ -53,6 +62,7 @@ class AgentRecord(Keepable):
     success: bool
     success_time: float | None
     strict_success: bool
+    reached: bool
     paper_success: bool
     collided: bool
     collision_time: float | None
@@ -336,6 +346,7 @@ def _agent(
         success=success,
         success_time=one["success_time"] if success else None,
         strict_success=ran and bool(one["strict_success"]),
+        reached=ran and bool(one["reached"]),
         paper_success=ran and bool(one["paper_success"]),
         collided=collided,
         collision_time=one["collision_time"] if collided else None,

@@ -26,18 +26,33 @@ from lagros_benchmarks.tasks.spacecraft.episodes import WorldRecord
 from lagros_benchmarks.tasks.spacecraft.experiment import SpacecraftRun
 from lagros_benchmarks.tasks.spacecraft.timing import Timing
 from lagros_envs.arrays import BoolArray
+from lagros_envs.tasks.spacecraft.scenarios import preset_named
+from lagros_envs.tasks.spacecraft.task import settings_for
 
 
 def figures(run: SpacecraftRun, case: Case) -> Row:
     """Return the figures of a policy, filtered or not, under one bound and number of agents."""
     worlds = run.episodes[case]
     return {
+        **_limits(run, case),
         **_outcomes(worlds),
         **_efforts(worlds),
         **_times(run.timing[case], run.control_period),
         **_tracking(worlds),
         **_guarantees(worlds),
         "counters": dict(run.counters[case]),
+    }
+
+
+def _limits(run: SpacecraftRun, case: Case) -> Row:
+    """Return what the preset makes of the task for this many agents."""
+    preset = preset_named(run.settings.preset or "paper").for_agents(case.agents)
+    task = settings_for(preset)
+    return {
+        "horizon_s": task.horizon,
+        "time_limit_s": task.time_limit,
+        "goal_radius_m": task.goal_radius,
+        "arena_m": preset.arena,
     }
 
 
@@ -86,6 +101,9 @@ def _outcomes(worlds: Sequence[WorldRecord]) -> Row:
         **_rate("strict_success", _each(worlds, "strict_success")),
         **_rate("paper_success", _each(worlds, "paper_success")),
         **_rate("collision", _each(worlds, "collided")),
+        **_rate("safe", ~_each(worlds, "collided")),
+        **_rate("reached", _each(worlds, "reached")),
+        **_rate("safe_reached", _each(worlds, "reached") & ~_each(worlds, "collided")),
         "world_success_rate": float(success.all(axis=1).mean()),
         "success_time_median_s": float(np.median(times)) if times else None,
         "plan_rate": None if None in planned else float(with_plan.mean()),

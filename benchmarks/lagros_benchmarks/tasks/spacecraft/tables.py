@@ -26,12 +26,16 @@ from lagros_benchmarks.report.formats import (
 from lagros_benchmarks.run.experiment import Row
 
 _LEGEND = (
-    "Rates are per agent. Success: within 0.2 m of the goal before 45 s and any collision, with a "
-    "95 % interval over worlds; strict: there at the end, never collided; paper: inside the "
-    "paper's tube around the goal; coll.: collided, ever. ∫‖u‖²: mean effort of an agent to "
-    "success, else to the end. Δt: one agent's decision; of a policy that plans for all agents "
-    "together, that plan."
+    "Rates are per agent. Success: within {goal_radius_m:g} m of the goal before "
+    "{time_limit_s:g} s and any collision, with a 95 % interval over worlds; {others}. "
+    "∫‖u‖²: mean effort of an agent to success, else to the end. Δt: one agent's decision; of a "
+    "policy that plans for all agents together, that plan."
 )
+_OURS = (
+    "strict: there at the end, never collided; paper: inside the paper's tube around the goal; "
+    "coll.: collided, ever"
+)
+_ANCHORS = "safe: never collided; reached: within that distance, ever; both: the two together"
 _LABEL = 15
 _WIDTH = 80
 _MOST_COLUMNS = 5  # of a sweep beside each other
@@ -69,6 +73,21 @@ _COLUMNS: tuple[Column, ...] = (
 )
 
 
+# The three rates of GCBF+ in place of the paper's, for its task.
+_ANCHORS_COLUMNS: tuple[Column, ...] = (
+    *_COLUMNS[:2],
+    ("safe", "%", lambda row: percent(row["safe_rate"])),
+    ("reached", "%", lambda row: percent(row["reached_rate"])),
+    ("both", "%", lambda row: percent(row["safe_reached_rate"])),
+    *_COLUMNS[5:],
+)
+
+
+def _as_the_anchor(row: Row) -> bool:
+    """Return whether the row is of the task of GCBF+ and has its rates."""
+    return str(row.get("preset")).startswith("gcbf") and "reached_rate" in row
+
+
 def framed(row: Row) -> bool:
     """Return whether there is room for a frame: not beside the widest figures of eight columns."""
     return False
@@ -76,12 +95,13 @@ def framed(row: Row) -> bool:
 
 def legend(row: Row) -> str:
     """Return what the columns mean."""
-    return _LEGEND
+    usual = {"goal_radius_m": 0.2, "time_limit_s": 45.0}  # of rows that do not say
+    return _LEGEND.format(**{**usual, **row, "others": _ANCHORS if _as_the_anchor(row) else _OURS})
 
 
 def columns(row: Row) -> tuple[Column, ...]:
-    """Return the columns, which are the same for every row."""
-    return _COLUMNS
+    """Return the columns of a row's preset."""
+    return _ANCHORS_COLUMNS if _as_the_anchor(row) else _COLUMNS
 
 
 def title(row: Row) -> str:
@@ -150,6 +170,8 @@ def sweeps(rows: Sequence[Row]) -> Iterator[tuple[str, list[str], list[list[str]
             part = points[begin : begin + _MOST_COLUMNS]
             shown = [row for row in series if _point(row, scale) in part]
             measures = [_SUCCESS, _EFFORT, _TOTAL, _DELAY, *([_BATCH] if scale else [])]
+            if all(map(_as_the_anchor, shown)):
+                measures.insert(1, _SAFE_REACHED)
             if any(row.get("guaranteed_rate") is not None for row in shown):
                 measures.insert(1, _GUARANTEED)
             for name, _, content in measures:
@@ -207,6 +229,13 @@ def _success(row: Row) -> str:
 
 
 _SUCCESS: Column = ("Success [%], ± the wider side of its 95 % interval over worlds", "", _success)
+_SAFE_REACHED: Column = (
+    "Safe / reached / both, the rates of GCBF+ [%]",
+    "",
+    lambda row: " / ".join(
+        percent(row[name]) for name in ("safe_rate", "reached_rate", "safe_reached_rate")
+    ),
+)
 _EFFORT: Column = ("Effort [N²s]", "", _effort)
 _TOTAL: Column = (
     "Effort over the same time, to the time limit [N²s]",
@@ -243,5 +272,5 @@ def markdown_grids(groups: Sequence[Sequence[Row]]) -> list[str]:
         blocks += [name.replace("\n", ": "), markdown_table(headings, trimmed)]
     swept = [row for series in _series(rows) for row in series]
     for group in (group for group in groups if group[0] not in swept):
-        blocks += [condition_title(group[0]), markdown_rows(_COLUMNS, ordered(group))]
+        blocks += [condition_title(group[0]), markdown_rows(columns(group[0]), ordered(group))]
     return blocks

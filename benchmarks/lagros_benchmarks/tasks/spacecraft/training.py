@@ -7,6 +7,7 @@ PettingZoo's environment through `ParallelVecEnv`; both give the same episodes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from lagros_envs.arrays import FloatArray
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.tasks.spacecraft.scenarios import preset_named
 from lagros_envs.tasks.spacecraft.sensing import Layout
-from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings, settings_for
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.tasks.spacecraft.ppo import (
     FEATURES,
@@ -162,12 +163,13 @@ class SpacecraftLesson:
 
     def __init__(self, training: SpacecraftTraining, parallel_env: bool = False) -> None:
         self.training = training
-        settings = SpacecraftSettings(
+        preset = preset_named(training.preset).for_agents(training.agents)
+        settings = replace(
+            settings_for(preset),
             time_limit=training.time_limit,
             effort_weight=training.effort_weight,
             progress_weight=training.progress_weight,
         )
-        preset = preset_named(training.preset).for_agents(training.agents)
         layout = Layout.for_preset(preset, settings)
         self.shaped = ShapedReward(
             _rows(training, settings, parallel_env),
@@ -227,7 +229,8 @@ class SpacecraftLesson:
         """Write the actor as safetensors."""
         network = actor_network(model)
         # It trains in shorter episodes, and is judged in those of the task.
-        trained_for = spacecraft_range(SpacecraftSettings(), [self.training.preset])
+        preset = preset_named(self.training.preset)
+        trained_for = spacecraft_range(settings_for(preset), [preset])
         name = self.training.algorithm.name
         network.metadata.update(weights_record("spacecraft", name, trained_for))
         network.save(path)
@@ -235,7 +238,10 @@ class SpacecraftLesson:
     def _fly(
         self, model: BaseAlgorithm, preset: str, agents: int, seeds: Sequence[int], bound: float
     ) -> dict[str, NDArray[Any]]:
-        policy = SpacecraftPpoPolicy(SpacecraftSettings(), preset, agents, actor_network(model))
+        # It is judged in other worlds than those in which it learns, too.
+        policy = SpacecraftPpoPolicy(
+            None, preset, agents, actor_network(model), allow_other_settings=True
+        )
         return evaluate(policy, preset, agents, seeds, self.training.disturbance, bound)
 
 

@@ -19,7 +19,7 @@ from lagros_envs.arrays import FloatArray
 from lagros_envs.balls import onto_unit_sphere
 from lagros_envs.disturbances import Situation
 from lagros_envs.tasks.spacecraft import task
-from lagros_envs.tasks.spacecraft.scenarios import Scenario
+from lagros_envs.tasks.spacecraft.scenarios import Scenario, preset_named
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.policy import BasePolicy, as_policy
 
@@ -163,8 +163,9 @@ class SpacecraftTarget:
         remember_plans(self.policy)
 
     @property
-    def _steps(self) -> int:
-        return task.SpacecraftSettings().steps
+    def task(self) -> task.SpacecraftSettings:
+        """The task of these worlds."""
+        return task.settings_for(preset_named(self.preset).for_agents(self.agents))
 
     def environment(self, worlds: int, disturbance: Any) -> SpacecraftVectorEnv:
         """Return worlds under a disturbance."""
@@ -176,7 +177,7 @@ class SpacecraftTarget:
         Where the policy raises the adversaries fly one by one, and one under which it does so is
         infinitely bad.
         """
-        pushes = np.zeros((len(points), self._steps, self.agents, task.STATE_DIM))
+        pushes = np.zeros((len(points), self.task.steps, self.agents, task.STATE_DIM))
         with Attempt():
             return self.fly_adversaries(points, pushes).scores, pushes
         if len(points) == 1:
