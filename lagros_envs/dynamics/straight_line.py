@@ -194,6 +194,22 @@ def scalar_source(
     )
 
 
+def plain_source(line: StraightLine) -> str:
+    """Return a module in Python: a function `held` of one sequence, of the inputs, to a tuple."""
+    lines, outputs = statements(line)
+    return "\n".join(
+        [
+            IMPORTS,
+            "",
+            "def held(given):",
+            f"    {', '.join(line.inputs)}, = given",
+            *(f"    {one}" for one in lines),
+            f"    return {', '.join(outputs)},",
+            "",
+        ]
+    )
+
+
 def statements(step: StraightLine, write: Write | None = None) -> tuple[list[str], list[str]]:
     """Return the operations as assignments, and the outputs as expressions.
 

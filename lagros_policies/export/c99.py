@@ -111,7 +111,7 @@ def c_file(source: Source, tanh: Tanh = "rational") -> str:
             _header(source, tanh),
             *([rational_tanh_source()] if rational else []),
             *(part for kind in program.bodies for part in _see(program, kind)),
-            *_network("network", program.layers, hidden, "none"),
+            *_forward(program, hidden),
             *_answer(program),
             *_interface(source),
             _self_test(source),
@@ -148,7 +148,7 @@ def _header(source: Source, tanh: Tanh) -> str:
         between = "tanhf of libm (link with -lm)"
     elif program.tanh:
         between = f"a tanh that is rational, within {TANH_ERROR:.0e} of tanh, relative"
-    shapes = [("the network", program.layers), *((one.name, one.layers) for one in program.bodies)]
+    shapes = [*_shapes(program), *((one.name, one.layers) for one in program.bodies)]
     widths = "; ".join(f"{name} {_widths(layers)}" for name, layers in shapes)
     notes = (*program.notes, f"Layers: {widths}; between them {between}.")
     declarations = "".join(f"{head};\n" for head in _signatures(source))
@@ -165,6 +165,15 @@ def _header(source: Source, tanh: Tanh) -> str:
 
 def _comment(text: str) -> str:
     return textwrap.fill(text, 98, initial_indent=" * ", subsequent_indent=" *     ")
+
+
+def _shapes(program: Program) -> list[tuple[str, Layers]]:
+    """Return the parts of the network by name."""
+    if program.repeated is None:
+        return [("the network", program.layers)]
+    (things, _), layers = program.repeated.alike, program.repeated.layers
+    names = (f"each of {things} alike, with the rest", "the rest", "what both add up to")
+    return [*zip(names, (layers[0:4:2], layers[1:4:2], layers[4:]), strict=True)]
 
 
 def _widths(layers: Layers) -> str:
@@ -209,6 +218,40 @@ def _network(name: str, layers: Layers, hidden: Activation, final: Activation) -
             memory.append(f"float {between[index + 1]}[{len(bias)}];")
     head = f"static void {name}(const float *restrict input, float *restrict output)"
     yield _function(head, [*memory, *calls])
+
+
+def _forward(program: Program, hidden: Activation) -> Iterator[str]:
+    """Yield the layers of the network and the function `network`."""
+    if program.repeated is None:
+        yield from _network("network", program.layers, hidden, "none")
+        return
+    (things, size), layers = program.repeated.alike, program.repeated.layers
+    (weight, bias), second = layers[0], layers[2]
+    rest, wide, last = len(weight) - size, len(bias), len(second[1])
+    # What all of them see is the same for all, and goes through the first layer once.
+    yield layer("shared", weight[:rest], bias, "none")
+    yield layer("each0", weight[rest:], None, hidden)
+    yield layer("each1", *second, hidden)
+    yield from _network("rest", layers[1:4:2], hidden, hidden)
+    yield from _network("sum", layers[4:], hidden, "none")
+    yield _function(
+        "static void network(const float *restrict input, float *restrict output)",
+        [
+            f"float start[{wide}], first[{wide}], second[{last}], both[{2 * last}];",
+            "int i, j;",
+            f"for (j = 0; j < {last}; j++)",
+            "    both[j] = 0.0f;",
+            "shared(input, start);",
+            f"for (i = 0; i < {things}; i++) {{",
+            f"    each0(input + {rest} + {size} * i, start, first);",
+            "    each1(first, second);",
+            f"    for (j = 0; j < {last}; j++)",
+            "        both[j] += second[j];",
+            "}",
+            f"rest(input, both + {last});",
+            "sum(both, output);",
+        ],
+    )
 
 
 def _see(program: Program, kind: Bodies) -> Iterator[str]:

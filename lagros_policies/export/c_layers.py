@@ -2,7 +2,7 @@
 
 A layer adds the rows of its matrix, each times one input, into as many sums as it has outputs:
 loops that a compiler may vectorise without changing the result. Two things make them fast.
-Rows of even and odd number have sums of their own, so that no addition waits for the one before;
+Four rows are added at a time, so that the sums are read and written once for them;
 and outputs beyond a multiple of 16 (the longest vectors) have a matrix of their own, so that the
 rows of the first stay aligned and both loops are unrolled whole.
 """
@@ -26,75 +26,92 @@ TANH_Q = (1.0, 0.46714342, 0.025876984, 0.00032856353, 7.7765606e-07)
 TANH_ERROR = 4e-7
 
 VECTOR = 16  # floats in the longest vector of a processor in use
+_ROWS = 4  # that are added at a time
 # Sums of a single output, kept apart so that they can be formed side by side.
 _LANES = (20, 16, 8, 4, 2, 1)
 
 
-def layer(name: str, weight: Float32Array, bias: Float32Array, activation: Activation) -> str:
+def layer(
+    name: str, weight: Float32Array, bias: Float32Array | None, activation: Activation
+) -> str:
     """Return the weights of a layer and `static void NAME(const float *input, float *output)`.
 
     Args:
         name: Of the function, and the beginning of the names of its arrays.
         weight: Shape (inputs, outputs).
-        bias: Shape (outputs,).
+        bias: Shape (outputs,); None where the function takes it, `const float *bias`, after its
+            input.
         activation: What follows. "rational" calls `rational_tanh`, of `rational_tanh_source`, and
             "libm" `tanhf`; "relu" gives NaN for NaN.
     """
-    if weight.shape[1] < VECTOR and weight.shape[0] > weight.shape[1]:
-        return _narrow(name, weight, bias, activation)
-    return _wide(name, weight, bias, activation)
+    narrow = weight.shape[1] < VECTOR and weight.shape[0] > weight.shape[1]
+    arrays, lines = (_narrow if narrow else _wide)(name, weight)
+    if bias is not None:
+        arrays.append(array(f"{name}_bias", bias))
+        lines = [line.replace("bias[", f"{name}_bias[") for line in lines]
+    given = ", const float *restrict bias" if bias is None else ""
+    return "\n".join(
+        [
+            *arrays,
+            f"static void {name}(const float *restrict input{given}, float *restrict output)",
+            "{",
+            *lines,
+            *_activation(activation, weight.shape[1]),
+            "}",
+            "",
+        ]
+    )
 
 
-def _wide(name: str, weight: Float32Array, bias: Float32Array, activation: Activation) -> str:
+def _wide(name: str, weight: Float32Array) -> tuple[list[str], list[str]]:
+    """Return arrays and lines of a layer of many outputs: the rows of its matrix, added up."""
     inputs, outputs = weight.shape
     split = outputs - outputs % VECTOR
     # Of each part: what its names end with, its width and its first output.
     parts = [("", split, 0), ("_rest", outputs - split, split)]
     parts = [part for part in parts if part[1]]
-    paired = inputs - inputs % 2
     arrays = [
         array(f"{name}_weight{end}", weight[:, first : first + width])
         for end, width, first in parts
     ]
-    sums = ", ".join(f"even{end}[{width}], odd{end}[{width}]" for end, width, _ in parts)
-    steps = ", ".join(f"row{end} += {2 * width}" for end, width, _ in parts)
+    sums = ", ".join(f"sum{end}[{width}]" for end, width, _ in parts)
+    whole = inputs - inputs % _ROWS
     lines = [
         *(f"    const float *restrict row{end} = {name}_weight{end};" for end, _, _ in parts),
         f"    float {sums};",
-        "    int i, j;" if paired else "    int j;",
+        "    int i, j;" if whole else "    int j;",
     ]
     for end, width, first in parts:
-        lines += [
-            f"    for (j = 0; j < {width}; j++) {{",
-            f"        even{end}[j] = {name}_bias[{_index('j', first)}];",
-            f"        odd{end}[j] = 0.0f;",
-            "    }",
-        ]
-    if paired:
-        lines.append(f"    for (i = 0; i < {paired}; i += 2, {steps}) {{")
+        lines += [_loop(width), f"        sum{end}[j] = bias[{_index('j', first)}];"]
+    if whole:
+        steps = ", ".join(f"row{end} += {_ROWS * width}" for end, width, _ in parts)
+        lines.append(f"    for (i = 0; i < {whole}; i += {_ROWS}, {steps}) {{")
         for end, width, _ in parts:
-            for parity, which, offset in (("even", "i", 0), ("odd", "i + 1", width)):
-                lines += [
-                    f"        for (j = 0; j < {width}; j++)",
-                    f"            {parity}{end}[j] += input[{which}] * "
-                    f"row{end}[{_index('j', offset)}];",
-                ]
+            terms = _terms(end, width, [_index("i", row) for row in range(_ROWS)])
+            lines += [f"    {_loop(width)}", f"            sum{end}[j] += {terms};"]
         lines.append("    }")
-    if inputs > paired:
+    if inputs > whole:
         for end, width, _ in parts:
-            lines += [
-                f"    for (j = 0; j < {width}; j++)",
-                f"        even{end}[j] += input[{paired}] * row{end}[j];",
-            ]
+            terms = _terms(end, width, [str(row) for row in range(whole, inputs)])
+            lines += [_loop(width), f"        sum{end}[j] += {terms};"]
     for end, width, first in parts:
-        lines += [
-            f"    for (j = 0; j < {width}; j++)",
-            f"        output[{_index('j', first)}] = even{end}[j] + odd{end}[j];",
-        ]
-    return _function(name, [*arrays, array(f"{name}_bias", bias)], lines, outputs, activation)
+        lines += [_loop(width), f"        output[{_index('j', first)}] = sum{end}[j];"]
+    return arrays, lines
 
 
-def _narrow(name: str, weight: Float32Array, bias: Float32Array, activation: Activation) -> str:
+def _loop(count: int) -> str:
+    return f"    for (j = 0; j < {count}; j++)"
+
+
+def _terms(end: str, width: int, inputs: list[str]) -> str:
+    """Return the sum of the next rows, each times its input."""
+    rows = (_index("j", place * width) for place in range(len(inputs)))
+    return " + ".join(
+        f"input[{one}] * row{end}[{row}]" for one, row in zip(inputs, rows, strict=True)
+    )
+
+
+def _narrow(name: str, weight: Float32Array) -> tuple[list[str], list[str]]:
     """Return a layer of few outputs: for each a product of its column and the inputs."""
     inputs, outputs = weight.shape
     lanes = next(count for count in _LANES if inputs % count == 0)
@@ -103,7 +120,7 @@ def _narrow(name: str, weight: Float32Array, bias: Float32Array, activation: Act
         "    int i, j, k;",
         f"    for (k = 0; k < {outputs}; k++, column += {inputs}) {{",
         f"        float sums[{lanes}] = {{0.0f}};",
-        f"        float sum = {name}_bias[k];",
+        "        float sum = bias[k];",
         f"        for (i = 0; i < {inputs}; i += {lanes})",
         f"            for (j = 0; j < {lanes}; j++)",
         "                sums[j] += input[i + j] * column[i + j];",
@@ -112,24 +129,7 @@ def _narrow(name: str, weight: Float32Array, bias: Float32Array, activation: Act
         "        output[k] = sum;",
         "    }",
     ]
-    arrays = [array(f"{name}_weight", weight.T), array(f"{name}_bias", bias)]
-    return _function(name, arrays, lines, outputs, activation)
-
-
-def _function(
-    name: str, arrays: list[str], lines: list[str], outputs: int, activation: Activation
-) -> str:
-    return "\n".join(
-        [
-            *arrays,
-            f"static void {name}(const float *restrict input, float *restrict output)",
-            "{",
-            *lines,
-            *_activation(activation, outputs),
-            "}",
-            "",
-        ]
-    )
+    return [array(f"{name}_weight", weight.T)], lines
 
 
 def _activation(activation: Activation, outputs: int) -> list[str]:
@@ -170,7 +170,7 @@ def _horner(coefficients: tuple[float, ...]) -> str:
 
 
 def _index(variable: str, offset: int) -> str:
-    return f"{offset} + {variable}" if offset else variable
+    return f"{variable} + {offset}" if offset else variable
 
 
 def array(name: str, values: Float32Array) -> str:

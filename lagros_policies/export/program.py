@@ -15,6 +15,7 @@ from typing import Any
 from lagros_envs.arrays import Float32Array
 from lagros_envs.dynamics.straight_line import StraightLine, straight_line
 from lagros_envs.numbers import functions
+from lagros_policies.learning.layers import Alike
 
 Layers = Sequence[tuple[Float32Array, Float32Array]]
 Numbers = Sequence[Any]
@@ -68,6 +69,19 @@ class Bodies:
 
 
 @dataclass(frozen=True)
+class Repeated:
+    """Layers of a network that treats some of its inputs alike, each kept once.
+
+    Attributes:
+        alike: Which inputs.
+        layers: As `learning.layers.written_out` takes them.
+    """
+
+    alike: Alike
+    layers: Layers
+
+
+@dataclass(frozen=True)
 class Program:
     """A policy as functions and layers.
 
@@ -80,6 +94,7 @@ class Program:
             controls of.
         control: The controls.
         tanh: Whether tanh stands between the layers; else it is a ReLU.
+        repeated: The same network without the repetitions of `layers`; None where it has none.
         bodies: In the order of the observation, and of the network's inputs.
         last: Matrix that makes controls of what `act` returns, followed by a ReLU.
         notes: What else there is to say, a sentence each.
@@ -92,6 +107,7 @@ class Program:
     act: Callable[[Numbers, Numbers], Numbers]
     control: Part
     tanh: bool = True
+    repeated: Repeated | None = None
     bodies: tuple[Bodies, ...] = ()
     last: Float32Array | None = None
     notes: tuple[str, ...] = ()

@@ -11,7 +11,7 @@ import numpy as np
 from lagros_envs.arrays import Float32Array
 from lagros_envs.numbers import functions
 from lagros_envs.task import Task
-from lagros_policies.export.program import Numbers, Part, Program
+from lagros_policies.export.program import Numbers, Part, Program, Repeated
 from lagros_policies.export.source import Exported
 from lagros_policies.learning.features import See, seen
 from lagros_policies.learning.networks import Mlp
@@ -36,6 +36,7 @@ def exported(policy: Any) -> Exported:
         list(zip(network.weights, network.biases, strict=True)),
         act,
         _control(task),
+        repeated=None if network.alike is None else Repeated(network.alike, network.stored),
         notes=(f"The task: {task.env_id}.",),
         metadata=(("unit", ", ".join(name.partition("[")[2][:-1] for name in task.control_names)),),
     )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagros_envs.task import Task
-from lagros_policies.learning.features import seen, view_of
+from lagros_policies.learning.features import RecordedView, seen, view_of
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.observed import observed_rows
 from lagros_policies.policy import BasePolicy, PolicyState
@@ -55,6 +55,7 @@ class NetworkPolicy(BasePolicy):
                 f"{path} has {self.network.inputs} inputs and {self.network.outputs} outputs; "
                 f"a {task.name} network has {wanted[0]} and {wanted[1]}"
             )
+        self._look = RecordedView(self.see, task.layout.size)
         self._check_episodes = check_weights(
             task, self.network.metadata, str(path), self, True, allow_other_settings
         )
@@ -78,7 +79,7 @@ class NetworkPolicy(BasePolicy):
         """
         rows = observed_rows(observation, self.settings.layout.size, np.float32)
         self._check_episodes(rows)
-        features, signs = seen(self.see, rows)
+        features, signs = seen(self._look, rows)
         control = self.network(features)
         if self._centre is not None:
             control = (control if signs is None else control * signs) - self._centre

@@ -49,6 +49,11 @@ class Mlp:
 
     Raises:
         ValueError: The shapes do not chain, or a number is not finite.
+
+    Attributes:
+        weights: Of the layers, in float32, written out where inputs are alike.
+        biases: Likewise.
+        stored: Weights and biases as the file holds them.
     """
 
     def __init__(
@@ -62,7 +67,10 @@ class Mlp:
         """Copy the layers to float32."""
         if not weights or len(weights) != len(biases):
             raise ValueError(f"{len(weights)} weight matrices need as many biases")
-        self._alike, self._stored = alike, list(zip(weights, biases, strict=True))
+        self.alike = alike
+        self.stored = [
+            (_float32(one), _float32(other)) for one, other in zip(weights, biases, strict=True)
+        ]
         if alike is not None:
             weights, biases = written_out(weights, biases, alike)
         layers = checked_layers(list(zip(weights, biases, strict=True)))
@@ -148,9 +156,9 @@ class Mlp:
         """Write weights and metadata as safetensors, atomically."""
         layers = list(zip(self.weights, self.biases, strict=True))
         metadata = {**self.metadata, "format": _FORMAT, "activation": "tanh"}
-        if self._alike is not None:
-            layers = [(_float32(weight), _float32(bias)) for weight, bias in self._stored]
-            metadata[_ALIKE] = json.dumps(self._alike)
+        if self.alike is not None:
+            layers = self.stored
+            metadata[_ALIKE] = json.dumps(self.alike)
         if self.scheduled:
             metadata[_SCHEDULED] = str(self.scheduled)
         write_safetensors(path, tensors_of({_LAYER: layers}), metadata)

@@ -7,12 +7,15 @@ import subprocess
 import numpy as np
 import pytest
 
+from lagros_envs.registry import find_task
 from lagros_envs.tasks.cartpole import task
 from lagros_policies.export import check, load_source
 from lagros_policies.export.c99 import TANHS, c_file
 from lagros_policies.export.c_layers import TANH_ERROR
 from lagros_policies.export.onnx import network_model, onnx_file
 from lagros_policies.export.single import example_observations
+from lagros_policies.learning.features import seen, view_of
+from lagros_policies.learning.layers import written_out
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.room import PRETRAINED
 
@@ -90,6 +93,30 @@ def test_c_of_any_network(tmp_path, widths, observations):
         with check.CompiledPolicy(c_file(source, tanh), source) as compiled:
             forces = compiled.answer(observations)
         np.testing.assert_allclose(forces, wanted, rtol=1e-5, atol=1e-5)
+
+
+@needs_compiler
+@pytest.mark.parametrize("hidden", [(5, 3, 4), (32, 17, 20, 9), (20, 16, 33)])
+def test_c_of_a_network_that_treats_discs_alike(tmp_path, hidden):
+    """Its layers are kept once there, and written out here."""
+    car, rng = find_task("car"), np.random.default_rng(1)
+    view = view_of(car)
+    rest, (wide, last, *others) = len(view.names) - view.alike.things * view.alike.size, hidden
+    shapes = [(rest + view.alike.size, wide), (rest, wide), (wide, last), (wide, last)]
+    shapes += itertools.pairwise([2 * last, *others, 2])
+    weights = [rng.standard_normal(shape) / np.sqrt(shape[0]) for shape in shapes]
+    biases = [rng.standard_normal(shape[1]) for shape in shapes]
+    file = tmp_path / "discs.safetensors"
+    Mlp(weights, biases, alike=view.alike).save(file)
+    source = load_source("lagros-car", file)
+    rows = example_observations(car, 300)
+    wanted = seen(view, rows)[0].astype(float)
+    for weight, bias in zip(*written_out(weights, biases, view.alike), strict=True):
+        wanted = np.tanh(wanted) if wanted.shape[1] != len(view.names) else wanted
+        wanted = wanted @ weight + bias
+    for tanh in TANHS:
+        with check.CompiledPolicy(c_file(source, tanh), source) as compiled:
+            np.testing.assert_allclose(compiled.answer(rows), wanted, rtol=1e-5, atol=1e-5)
 
 
 @needs_compiler

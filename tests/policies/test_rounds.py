@@ -1,5 +1,6 @@
 """What any task's networks see, and the flights of DAgger, against definition and environment."""
 
+import pickle
 from dataclasses import dataclass
 
 import gymnasium as gym
@@ -11,12 +12,14 @@ from lagros_envs.numbers import Dual, functions
 from lagros_envs.registry import find_task
 from lagros_envs.task import Learning, Scenario
 from lagros_envs.tasks.pvtol.task import PvtolSettings
+from lagros_policies.export.single import example_observations
 from lagros_policies.learning.dataset import ExpertDataSettings, generate
-from lagros_policies.learning.features import moved, seen, view_of
+from lagros_policies.learning.features import RecordedView, Seen, moved, seen, view_of
 from lagros_policies.learning.metric import MetricSettings, metric_settings
 from lagros_policies.learning.network_policy import NetworkPolicy
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.learning.rounds import flown, met_states
+from tests.found import SINGLE_BODY, named, task_of
 from tests.policies.toys import Drive, Slide
 
 
@@ -238,6 +241,31 @@ def test_a_round_gives_data_around_plans_that_begin_under_way(tmp_path):
     # Another network is another round.
     with pytest.raises(ValueError, match="round holds expert data of other settings"):
         generate(tmp_path / "round", metric, settings, task, network=a_network(task))
+
+
+@pytest.mark.parametrize("name", named(SINGLE_BODY))
+def test_recorded_a_view_sees_the_same_to_the_last_bit(name, monkeypatch):
+    task = task_of(name)
+    view, rows = view_of(task), example_observations(task, 50)
+    wanted = [seen(view, row) for row in rows]
+    quick = pickle.loads(pickle.dumps(RecordedView(view, task.layout.size)))
+    # It is not asked again.
+    monkeypatch.setattr(type(view), "__call__", None)
+    for row, given in zip(rows, wanted, strict=True):
+        for found, one in zip(seen(quick, row), given, strict=True):
+            assert (found is None) == (one is None)
+            assert found is None or found.tobytes() == one.tobytes()
+
+
+def test_a_view_that_branches_is_asked_itself():
+    class Branching:
+        names = ("size",)
+
+        def __call__(self, observation, functions):
+            return Seen([observation[0] if observation[0] > 0.0 else -observation[0]])
+
+    quick = RecordedView(Branching(), 1)
+    assert [seen(quick, np.array([x], np.float32))[0][0] for x in (-2.0, 3.0)] == [2.0, 3.0]
 
 
 def test_a_network_that_is_to_keep_plans_sees_which_plan_it_is_on():
