@@ -20,13 +20,24 @@ from lagros_policies.inspection.finding import VERDICTS, Finding, Verdict, count
 __all__ = ["VERDICTS", "Finding", "Verdict", "count", "inspect_task", "verdict_of"]
 
 
-def inspect_task(task: Task, episodes: int = 8, seed: int = 0) -> list[Finding]:
+# Times that something is looked at where no fault is before it.
+_LOOKS = 12
+
+
+def inspect_task(
+    task: Task,
+    episodes: int = 8,
+    seed: int = 0,
+    tell: Callable[[str, int, int], None] = lambda *done: None,
+) -> list[Finding]:
     """Look at a task of one body in every way in which it is used.
 
     Args:
         task: The task.
         episodes: Random episodes that are planned and flown.
         seed: Seed of them.
+        tell: Called with what is being done, how often something was looked at, and how often in
+            all.
 
     Returns:
         What was found, in the order in which it was looked at. Nothing is looked at that needs
@@ -37,6 +48,7 @@ def inspect_task(task: Task, episodes: int = 8, seed: int = 0) -> list[Finding]:
         check_task(task)
     except (TypeError, ValueError) as error:
         return [refused(error)]
+    looks: list[str] = []
     found = [Finding("description", "ok", "shapes, scenarios and the equation on all numbers")]
 
     def look(subject: str, at: Callable[[], Finding | list[Finding]]) -> None:
@@ -49,6 +61,8 @@ def inspect_task(task: Task, episodes: int = 8, seed: int = 0) -> list[Finding]:
             text = f"{type(error).__name__}: {error}"
             seen = Finding(subject, "fault", text, remedy)
         found.extend(seen if isinstance(seen, list) else [seen])
+        looks.append(subject)
+        tell("looks", len(looks), _LOOKS)
 
     sample = [task.sample(np.random.default_rng([seed, index])) for index in range(episodes)]
     states, controls = motion.drawn_places(task, sample, np.random.default_rng(seed))

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from lagros_benchmarks.commands.attack import verdict
 from lagros_benchmarks.commands.cli import app
 from lagros_benchmarks.worst_case.replay import load_worst_cases, save_worst_cases
 
@@ -24,8 +25,9 @@ def test_attack_writes_its_figures_and_flies_them_again(tmp_path: Path) -> None:
         app, ["attack", "cartpole", "--episodes", "2", "--budget", "60", *options, *files]
     )
     assert done.exit_code == 0, done.output
-    assert "goal clearance, bound 0.3" in done.output
+    assert "goal clearance" in done.output
     row = json.loads(figures.read_text())
+    assert done.stdout.splitlines()[0] == row["verdict"] == verdict(row)
     left = sum(not one["measures"]["in_region"] for one in row["outcomes"])
     assert f"{left} of 2 flights left the region of the metric" in done.output
     assert (row["task"], row["policy"], row["bound"]) == ("cartpole", "lqr", 0.3)
@@ -58,6 +60,37 @@ def test_attack_writes_its_figures_and_flies_them_again(tmp_path: Path) -> None:
     outside = RUNNER.invoke(app, ["attack", "cartpole", "--replay", str(sequences)])
     assert outside.exit_code == 2
     assert "above the bound 0.3" in outside.output
+
+
+def test_the_verdict_claims_what_the_figures_do_and_no_more() -> None:
+    row = {
+        "policy": "lqr",
+        "safety_filter": True,
+        "goal": "success",
+        "bound": 0.3,
+        "episodes": 7,
+        "flights_per_episode": 90,
+        "score_worst": 1.5,
+        "random_score_worst": -2.0,
+        "broken_rate": 3 / 7,
+        "random_broken_rate": 1 / 7,
+    }
+    assert verdict(row) == (
+        "lqr+filter is broken in 3 of 7 episodes by a disturbance within d̄ = 0.3 (90 flights for "
+        "each), and in 1 by a random one."
+    )
+    kept = verdict(row | {"broken_rate": 0.0, "random_broken_rate": 0.0, "safety_filter": False})
+    assert kept.startswith("lqr was not broken in any of 7 episodes by the search")
+    assert kept.endswith("observed, and no proof.")
+    # Random disturbance alone may break what the search did not.
+    lucky = verdict(row | {"broken_rate": 0.0})
+    assert "random" in lucky
+    unsaid = verdict(row | {"goal": "return", "broken_rate": None, "random_broken_rate": None})
+    assert "-1.5" in unsaid
+    assert "2 under a random one" in unsaid
+    for text in (verdict(row), kept, lucky, unsaid):
+        assert "\n" not in text
+        assert text.endswith(".")
 
 
 POLICIES = """

@@ -105,6 +105,7 @@ BENCH = {
     "--address": Row(("",), ("cartpole --backend dask",), ("cartpole",), "tcp://127.0.0.1:1"),
     "--timing-episodes": Row(POSITIVE_WHOLE),
     "--guarantee": Row(FLAG, CARTPOLE, SPACECRAFT),
+    "--quiet": Row(FLAG),
     "--initial-error": Row(NUMBER, CARTPOLE, SPACECRAFT, "0.1"),
     "--replan-every": Row(POSITIVE_WHOLE, CARTPOLE, ("spacecraft", "cartpole --policies lqr"), "2"),
     "--json": Row(WRITTEN),
@@ -127,6 +128,7 @@ REPRODUCE = {
     "--address": Row(("",), ("cartpole --backend dask",), ("cartpole",), "tcp://127.0.0.1:1"),
     "--episodes": Row(POSITIVE_WHOLE),
     "--shipped-weights": Row(FLAG),
+    "--quiet": Row(FLAG),
 }
 WATCH = {
     "--policy": Row(POLICIES),
@@ -140,6 +142,7 @@ WATCH = {
     "--video": Row((*WRITTEN, "film", "film.avi", "film.", ".gif")),
     "--html": Row(WRITTEN),
     "--browser": Row(FLAG),
+    "--quiet": Row(FLAG),
     "--speed": Row(POSITIVE),
     "--seconds": Row(POSITIVE),
 }
@@ -164,6 +167,7 @@ CERTIFY = {
     "--episodes": Row(WHOLE),
     "--seconds": Row(POSITIVE),
     "--largest": Row(FLAG, CARTPOLE, SPACECRAFT),
+    "--quiet": Row(FLAG),
 }
 TRAIN = {
     "--algo": Row((*lists(NAMES, "ppo"), "lqr")),
@@ -173,6 +177,7 @@ TRAIN = {
     "--residual": Row((*POSITIVE, "41"), CARTPOLE, SPACECRAFT, "4"),
     "--parallel-env": Row(FLAG, SPACECRAFT, CARTPOLE),
     "--tensorboard": Row(FLAG),
+    "--quiet": Row(FLAG),
     "--json": Row(WRITTEN),
     "--figure": Row(FIGURES),
 }
@@ -205,6 +210,7 @@ ATTACK |= {
 }
 DATA = {
     "--minari": Row(FLAG, ("",)),
+    "--quiet": Row(FLAG, ("",)),
     "--task": Row(NAMES, MINARI),
     "--episodes": Row(POSITIVE_WHOLE, MINARI),
     "--seed": Row(WHOLE, MINARI),
@@ -229,18 +235,19 @@ SUITE = {
     "--markdown": Row(WRITTEN),
     "--figure": Row(FIGURES),
     "--out": Row(FOLDERS),
+    "--quiet": Row(FLAG),
     "tasks": Row(NAMES, ("",)),
 }
 ROWS = {
     "": {"--version": Row(FLAG, ("",))},
     "bench": BENCH | {"task": Row(NAMES, ("",))},
-    "demo": {},
+    "demo": {"--quiet": Row(FLAG, ("",))},
     "reproduce": REPRODUCE | {"task": Row(NAMES, ("",))},
     "watch": WATCH | {"task": Row(NAMES, ("",))},
     "export": EXPORT | {"policy": Row((*NAMES, "lqr"), ("",)), "task": Row(NAMES, ("",))},
     "certify": CERTIFY | {"task": Row(NAMES, ("",))},
     "train": TRAIN | {"task": Row(NAMES, ("",))},
-    "attack": ATTACK | {"task": Row(NAMES, ("",))},
+    "attack": ATTACK | {"--quiet": Row(FLAG), "task": Row(NAMES, ("",))},
     "data export": DATA,
     "suite": SUITE,
     "new": {
@@ -252,6 +259,7 @@ ROWS = {
         "--episodes": Row(POSITIVE_WHOLE, CARTPOLE),
         "--seed": Row(WHOLE),
         "--json": Row(WRITTEN),
+        "--quiet": Row(FLAG),
     },
     "doctor": {"--json": Row(FLAG, ("",))},
 }

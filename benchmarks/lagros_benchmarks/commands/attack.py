@@ -13,10 +13,12 @@ from lagros_benchmarks.commands.extras import check_extra
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs, policy_files
 from lagros_benchmarks.commands.terminal import (
     BOUND,
+    QUIET,
     fail,
     file_option,
     find_users_modules,
     options_given,
+    progress_bar,
     refuse_options,
 )
 
@@ -60,6 +62,7 @@ def attack(
         Path | None,
         file_option("Fly the sequences of such a file again, and fail where a figure differs."),
     ] = None,
+    quiet: Annotated[bool, QUIET] = False,
 ) -> None:
     """Search the worst bounded disturbance, fly it, and hold the certificate against it.
 
@@ -72,7 +75,8 @@ def attack(
     try:
         if replay is not None:
             refuse_options(
-                options_given(but=("--replay", "--policy")), "--replay flies what the file says"
+                options_given(but=("--replay", "--policy", "--quiet")),
+                "--replay flies what the file says",
             )
             _replay(task, policy, replay)
             return
@@ -102,9 +106,11 @@ def _search(settings: AttackSettings, json: Path | None, npz: Path | None) -> No
     from lagros_benchmarks.worst_case.attack import run_attack
     from lagros_benchmarks.worst_case.replay import save_worst_cases
 
-    found = run_attack(settings, lambda text: typer.echo(text, err=True))
+    with progress_bar() as tell:
+        found = run_attack(settings, tell)
     delivery = Delivery()
-    record = {"command": " ".join(["lagros", *sys.argv[1:]]), **found.row}
+    command = " ".join(["lagros", *sys.argv[1:]])
+    record = {"command": command, "verdict": verdict(found.row), **found.row}
     delivery.write_text(json, lambda: json_text(record))
     delivery.write(npz, lambda path: save_worst_cases(found.cases, path))
     for line in summary(found.row):
@@ -166,22 +172,38 @@ def _line(outcome: Outcome) -> str:
     return f"seed {outcome.seed} {broken} score {outcome.score!r}"
 
 
-def summary(row: dict[str, Any]) -> list[str]:
-    """Return what an attack came to, in a few lines."""
+def verdict(row: Mapping[str, Any]) -> str:
+    """Return what an attack came to, in one sentence."""
     worn = "+filter" if row["safety_filter"] else ""
-    count = row["episodes"]
+    count, name = row["episodes"], f"{row['policy']}{worn}"
+    under = f"d̄ = {row['bound']:g}"
     if row["broken_rate"] is None:
-        broken = "no return counts as broken: the environment names no threshold"
-    else:
-        broken = (
-            f"broken in {100 * row['broken_rate']:.0f} % of the episodes "
-            f"(random disturbance: {100 * row['random_broken_rate']:.0f} %)"
+        return (
+            f"The least return of {name} in {count} episodes is {-row['score_worst']:.4g} under a "
+            f"disturbance within {under} that was searched for, and "
+            f"{-row['random_score_worst']:.4g} under a random one; the environment names no "
+            "return that counts as broken."
         )
+    found, random = (round(count * row[key]) for key in ("broken_rate", "random_broken_rate"))
+    tried = f"{row['flights_per_episode']} flights for each"
+    if not found:
+        beside = f", but in {random} by a random disturbance" if random else ""
+        return (
+            f"{name} was not broken in any of {count} episodes by the search within {under}, "
+            f"{tried}{beside}: observed, and no proof."
+        )
+    return (
+        f"{name} is broken in {found} of {count} episodes by a disturbance within {under} "
+        f"({tried}), and in {random} by a random one."
+    )
+
+
+def summary(row: dict[str, Any]) -> list[str]:
+    """Return what an attack came to, in a sentence and a few lines."""
+    count = row["episodes"]
     lines = [
-        f"{row['task']}, {row['policy']}{worn}, goal {row['goal']}, bound {row['bound']:g}: "
-        f"{row['flights_per_episode']} flights for each of {count} episodes, "
-        f"{row['search_seconds']:.0f} s",
-        broken,
+        verdict(row),
+        f"{row['task']}, goal {row['goal']}, searched for {row['search_seconds']:.0f} s",
         f"worst score {row['score_worst']:.4g}, median {row['score_median']:.4g} "
         f"(random: worst {row['random_score_worst']:.4g})",
     ]

@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated, get_args
 import typer
 
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs
-from lagros_benchmarks.commands.terminal import fail, file_option, find_users_modules
+from lagros_benchmarks.commands.terminal import (
+    QUIET,
+    fail,
+    file_option,
+    find_users_modules,
+    progress_bar,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -54,6 +60,7 @@ def certify(
         bool,
         typer.Option("--largest", help="Claim the largest multiple of the region that is proved."),
     ] = False,
+    quiet: Annotated[bool, QUIET] = False,
 ) -> None:
     """Print for how many episodes what is guaranteed, and which kind each claim behind it is.
 
@@ -99,7 +106,8 @@ def certify(
         if metric is not None:
             check_file(metric)
         part = "certify_metric" if of_metric else "certify"
-        found = room_of(described).part(part)(described, question)
+        with progress_bar() as tell:
+            found = room_of(described).part(part)(described, question, tell)
     except UnservedError as error:
         fail(error)
     except (ValueError, OSError, RuntimeError, ImportError, SetupError) as error:
@@ -135,16 +143,16 @@ def check_asked(task: Described, policy: str) -> None:
 
 
 def print_certificate(found: Certificate) -> None:
-    """Print a certificate, 80 columns wide: what it comes to, its figures, every claim."""
+    """Print a certificate, 80 columns wide: one sentence, its figures, every claim."""
     from rich.console import Console
     from rich.text import Text
 
     console = Console(width=_WIDTH, highlight=False)
-    if found.headline:
-        console.print(Text(found.headline, style="bold"), soft_wrap=True)
-        console.print()
+    console.print(Text(found.headline or verdict(found), style="bold"), soft_wrap=True)
+    console.print()
     console.print(Text(f"Certificate of {found.task}, policy {found.policy}, d̄ = {found.d_bar:g}"))
-    console.print(Text(verdict(found), style="" if found.headline else "bold"))
+    if found.headline:
+        console.print(Text(verdict(found)))
     console.print()
     console.print(_numbers(found))
     console.print()

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs
-from lagros_benchmarks.commands.terminal import fail, file_option, find_users_modules
+from lagros_benchmarks.commands.terminal import (
+    QUIET,
+    fail,
+    file_option,
+    find_users_modules,
+    progress_bar,
+)
 
 if TYPE_CHECKING:
     from lagros_policies.inspection import Finding
@@ -26,6 +32,7 @@ def check(
     episodes: Annotated[int, typer.Option(help="Random episodes that are planned and flown.")] = 8,
     seed: Annotated[int, typer.Option(help="Seed; its episodes are of no other command.")] = 0,
     json: Annotated[Path | None, file_option("Write the findings.")] = None,
+    quiet: Annotated[bool, QUIET] = False,
 ) -> None:
     """Say what is wrong with a task of one body, and what to write instead.
 
@@ -56,7 +63,8 @@ def check(
     else:
         if not isinstance(described, Task):
             fail(f"{name} is a world of many agents; lagros check is for one body")
-        findings = inspect_task(described, episodes, seed)
+        with progress_bar() as tell:
+            findings = inspect_task(described, episodes, seed, tell)
     verdict = verdict_of(name, findings)
     record = {
         "task": name,

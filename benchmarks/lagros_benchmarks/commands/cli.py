@@ -22,6 +22,9 @@ from lagros_benchmarks.commands.outputs import check_outputs, policy_files
 from lagros_benchmarks.commands.streams import printing_failed
 from lagros_benchmarks.commands.suite import suite
 from lagros_benchmarks.commands.terminal import (
+    ADDRESS,
+    BACKEND,
+    QUIET,
     Command,
     Commands,
     fail,
@@ -54,12 +57,6 @@ TASK = typer.Argument(help="{tasks}; or one of your own: module:attribute, or a 
 ANY_TASK = typer.Argument(
     help="{tasks}; or one of your own: module:attribute, or a .py file; or gym:ID, an environment "
     "of Gymnasium's."
-)
-BACKEND_OPTION = typer.Option(
-    help="Where the workers run: loky (this machine), or a cluster of ray or dask."
-)
-ADDRESS_OPTION = typer.Option(
-    help="Of a running cluster of ray or dask, which is used with the workers that it has."
 )
 
 
@@ -118,8 +115,8 @@ def bench(
     jobs: Annotated[
         int, typer.Option(help="Worker processes; Δt is then measured in a serial pass after.")
     ] = 1,
-    backend: Annotated[str, BACKEND_OPTION] = "loky",
-    address: Annotated[str | None, ADDRESS_OPTION] = None,
+    backend: Annotated[str, BACKEND] = "loky",
+    address: Annotated[str | None, ADDRESS] = None,
     timing_episodes: Annotated[
         int, typer.Option(help="Episodes of that pass, which worlds of agents always have.")
     ] = 10,
@@ -179,6 +176,7 @@ def bench(
             f"If left out it is {BENCH_FOLDER}, and emptied at the end.",
         ),
     ] = None,
+    quiet: Annotated[bool, QUIET] = False,
 ) -> None:
     """Compare policies on the same episodes; print the table, write what is asked for.
 
@@ -247,7 +245,7 @@ def bench(
 
 
 @app.command(cls=Command)
-def demo() -> None:
+def demo(quiet: Annotated[bool, QUIET] = False) -> None:
     """The paper's first experiment: 50 paired episodes; then a few worlds of agents; a report."""
     from lagros_benchmarks.report.delivery import Outputs
     from lagros_benchmarks.run.settings import BenchmarkSettings
@@ -277,14 +275,15 @@ def reproduce(
         ),
     ] = None,
     jobs: Annotated[int, typer.Option(help="Worker processes; they change no result.")] = 2,
-    backend: Annotated[str, BACKEND_OPTION] = "loky",
-    address: Annotated[str | None, ADDRESS_OPTION] = None,
+    backend: Annotated[str, BACKEND] = "loky",
+    address: Annotated[str | None, ADDRESS] = None,
     episodes: Annotated[
         int | None, typer.Option(help="Episodes (worlds) of each policy in the table.")
     ] = None,
     shipped: Annotated[
         bool, typer.Option("--shipped-weights", help="Only the benchmark, with what is shipped.")
     ] = False,
+    quiet: Annotated[bool, QUIET] = False,
 ) -> None:
     """From nothing to the table and figures: metric or expert, data, training, benchmark."""
     from lagros_benchmarks.report.delivery import Outputs

@@ -17,7 +17,14 @@ import typer
 
 from lagros_benchmarks.commands.extras import check_extra
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs
-from lagros_benchmarks.commands.terminal import BOUND, Command, fail, progress_bar, refuse_options
+from lagros_benchmarks.commands.terminal import (
+    BOUND,
+    QUIET,
+    Command,
+    fail,
+    progress_bar,
+    refuse_options,
+)
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -51,6 +58,7 @@ def export(
     out: Annotated[
         Path, typer.Option(file_okay=False, help=f"Folder of datasets; Minari's {DATASETS_PATH}.")
     ] = Path("runs/minari"),
+    quiet: Annotated[bool, QUIET] = False,
 ) -> None:
     """Fly the expert and write its episodes, with the record of metric and planner."""
     if not minari:

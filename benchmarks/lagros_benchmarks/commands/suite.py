@@ -11,6 +11,7 @@ import typer
 
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs
 from lagros_benchmarks.commands.terminal import (
+    QUIET,
     fail,
     file_option,
     find_users_modules,
@@ -84,6 +85,7 @@ def suite(
             help="Keeps finished work, with which the same command goes on where it was killed.",
         ),
     ] = FOLDER,
+    quiet: Annotated[bool, QUIET] = False,
 ) -> None:
     """Fly every system with every policy at its own bound, and write one page of it.
 

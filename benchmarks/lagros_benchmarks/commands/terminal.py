@@ -19,6 +19,8 @@ from lagros_benchmarks.commands.streams import patient_streams
 from lagros_benchmarks.run.process import no_exit
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from lagros_benchmarks.run.workers import Progress
 
 USAGE_ERROR = 2
@@ -32,6 +34,14 @@ BOUND = typer.Option(
     help="Bound d̄ of the disturbance, in units of the state per second; the task's own if not "
     "given.",
 )
+BACKEND = typer.Option(
+    help="Where the workers run: loky (this machine), or a cluster of ray or dask."
+)
+ADDRESS = typer.Option(
+    help="Of a running cluster of ray or dask, which is used with the workers that it has."
+)
+# Read by `progress_bar` and `progress_line`, so that no command passes it on.
+QUIET = typer.Option("--quiet", help="No progress on the error stream; nor is there without one.")
 # The command that runs.
 _CONTEXT: ContextVar[Any] = ContextVar("context", default=None)
 # How the settings begin a message on one of their fields.
@@ -284,27 +294,39 @@ def listed_or_none(
 
 
 def progress_line(line: str) -> None:
-    """Print a line above the progress bar."""
-    typer.echo(line, err=True)
+    """Print a line above the progress bar, unless the command is to be quiet."""
+    if not _is_quiet():
+        typer.echo(line, err=True)
+
+
+def _is_quiet() -> bool:
+    context = _CONTEXT.get()
+    return context is not None and bool(context.params.get("quiet"))
 
 
 @contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """Give a function that draws progress on the terminal's error stream."""
+def progress_bar(console: Console | None = None) -> Iterator[Progress]:
+    """Give a function that draws progress and the time left on the terminal's error stream.
+
+    Nothing is drawn where that is no terminal, or where the command is to be quiet.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
-    console = Console(stderr=True)
+    console = console or Console(stderr=True)
     with Bar(
         TextColumn("{task.description:<9}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TimeRemainingColumn(),
+        TimeRemainingColumn(elapsed_when_finished=True),
         console=console,
         transient=True,
+        # The speed is that of the last hour: one of the last half minute would know none of
+        # chunks that take longer.
+        speed_estimate_period=3600.0,
         # Where nothing moves, all that would be left of it is an empty line.
-        disable=not console.is_terminal,
+        disable=not console.is_terminal or _is_quiet(),
     ) as bar:
         tasks: dict[str, Any] = {}
 

@@ -13,7 +13,14 @@ import typer
 
 from lagros_benchmarks.commands.extras import check_extra
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs
-from lagros_benchmarks.commands.terminal import fail, file_option, interrupted, listed
+from lagros_benchmarks.commands.terminal import (
+    QUIET,
+    fail,
+    file_option,
+    interrupted,
+    listed,
+    progress_bar,
+)
 
 if TYPE_CHECKING:
     from lagros_benchmarks.training.c3m_run import C3mRun
@@ -65,6 +72,7 @@ def train(
     ] = False,
     json: Annotated[Path | None, file_option("The learning curves of all runs.")] = None,
     figure: Annotated[Path | None, file_option("The same, drawn.")] = None,
+    quiet: Annotated[bool, QUIET] = False,
 ) -> None:
     """Train baselines, one after the other; go on where a run was killed, skip what is complete."""
     from lagros_benchmarks.training.course import course_of
@@ -110,7 +118,6 @@ def train(
         )
     except ValueError as error:
         fail(str(error).replace("largest_correction", "--residual"))
-    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(message)s")
     try:
         records = [
             _train_one(run, out, segments, residual, tensorboard, parallel_env, fill)
@@ -173,16 +180,19 @@ def _train_one(
     # One thread: networks this small gain nothing from more, and the sums stay reproducible.
     torch.set_num_threads(1)
     place = Place(folder_of(run, out), tensorboard)
-    if isinstance(run, C3mRun):
-        command = f"lagros train {run.task} --algo {run.label} --seed {run.seed}"
-        record = c3m.train(run, place, command)
-        name = run.label
-    else:
-        command = f"lagros train {run.task} --algo {run.algorithm.name} --seed {run.seed}"
-        command += "" if segments is None else f" --segments {segments}"
-        command += "" if residual is None else f" --residual {residual:g}"
-        record = train_run(run, place, lambda: lesson_of(run, parallel_env), command)
-        name = run.algorithm.name if residual is None else "residual"
+    with progress_bar() as tell:
+        # Of the error stream that is here, which prints above the bar.
+        logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(message)s")
+        if isinstance(run, C3mRun):
+            command = f"lagros train {run.task} --algo {run.label} --seed {run.seed}"
+            record = c3m.train(run, place, command, tell)
+            name = run.label
+        else:
+            command = f"lagros train {run.task} --algo {run.algorithm.name} --seed {run.seed}"
+            command += "" if segments is None else f" --segments {segments}"
+            command += "" if residual is None else f" --residual {residual:g}"
+            record = train_run(run, place, lambda: lesson_of(run, parallel_env), command, tell)
+            name = run.algorithm.name if residual is None else "residual"
     try:
         table = final_table(record)
     except (KeyError, TypeError, ValueError) as error:

@@ -11,9 +11,11 @@ import typer
 from lagros_benchmarks.commands.outputs import Delivery, check_outputs, policy_files
 from lagros_benchmarks.commands.terminal import (
     BOUND,
+    QUIET,
     fail,
     file_option,
     find_users_modules,
+    progress_bar,
     refuse_options,
     task_in_preset,
 )
@@ -60,6 +62,7 @@ def watch(
     seconds: Annotated[
         float | None, typer.Option(help="End after so many seconds of the episode.")
     ] = None,
+    quiet: Annotated[bool, QUIET] = False,
 ) -> None:
     """Watch one episode: bodies, what they sense, tubes, goals, collisions.
 
@@ -99,7 +102,11 @@ def watch(
     except (ImportError, SetupError) as error:
         fail(error, status=1)
     try:
-        film = playback.page().encode() if settings.page else playback.play()
+        if settings.page or video is None:
+            film = playback.page().encode() if settings.page else playback.play()
+        else:
+            with progress_bar() as tell:
+                film = playback.play(tell)
     except KeyboardInterrupt:
         if video is not None or settings.page:
             raise

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lagros_benchmarks.evidence.loops import Loop
+from lagros_benchmarks.run.workers import Progress, untold
 from lagros_benchmarks.worst_case.flights import Flights, fly, parts_of, random_pushes
 from lagros_benchmarks.worst_case.search import SearchSettings, search
 from lagros_benchmarks.worst_case.single import SingleTarget
@@ -165,11 +166,14 @@ def _proved(loop: Loop, bound: float) -> tuple[PlanTubes, Guarantees] | None:
     return tubes, found
 
 
-def _smaller(loop: Loop, bound: float, most_seconds: float) -> tuple[float, int] | None:
+def _smaller(
+    loop: Loop, bound: float, most_seconds: float, tell: Progress
+) -> tuple[float, int] | None:
     """Halve d_bar until most episodes are guaranteed, or time is up; return the last with any."""
     begun, found = time.monotonic(), None
     most = _MOST * (len(loop.episodes.seeds) + len(loop.episodes.unplanned))
-    while time.monotonic() - begun < most_seconds and bound > _LEAST:
+    while (spent := time.monotonic() - begun) < most_seconds and bound > _LEAST:
+        tell("smaller d̄, s", round(spent), round(most_seconds))
         bound = 0.5 * bound
         made = _proved(loop, bound)
         count = 0 if made is None else int(np.count_nonzero(made[1].holds))
@@ -177,6 +181,7 @@ def _smaller(loop: Loop, bound: float, most_seconds: float) -> tuple[float, int]
             found = bound, count
         if count >= most:
             break
+    tell("smaller d̄, s", round(most_seconds), round(most_seconds))
     return found
 
 
@@ -186,6 +191,7 @@ def evidence_of(
     kinds: Sequence[str],
     settings: SearchSettings = SEARCH,
     most_seconds: float = 0.0,
+    tell: Progress = untold,
 ) -> Evidence:
     """Prove what can be proved of the episodes of a loop, and look for what contradicts it.
 
@@ -195,30 +201,35 @@ def evidence_of(
         kinds: Kinds of random disturbance that are flown besides.
         settings: Of the search.
         most_seconds: Time to look for a smaller bound where nothing is guaranteed at this one [s].
+        tell: Called with what is being done, how much of it is, and of how much.
     """
     watch = Stopwatch()
     flown = loop.episodes
+    tell("proof", 0, 1)
     tubes, proved = _proved(loop, bound) or (None, None)
+    tell("proof", 1, 1)
     smaller = None
     if proved is not None and not proved.holds.any():
-        smaller = _smaller(loop, bound, most_seconds)
+        smaller = _smaller(loop, bound, most_seconds, tell)
     proof_seconds = watch.lap()
     target = TubeTarget(flown, loop.law, "error", bound, tubes=tubes)
-    found = search(target, settings, 0)
+    found = search(target, settings, 0, tell)
     search_seconds = watch.lap()
     every = np.arange(len(flown.seeds))
-    flights = tuple(
-        fly(flown, loop.law, every, random_pushes(flown, kind, bound)) for kind in kinds
-    )
-    for one in flights:
+    flights: list[Flights] = []
+    for kind in kinds:
+        tell("flights", len(flights), len(kinds))
+        one = fly(flown, loop.law, every, random_pushes(flown, kind, bound))
         target.note(every, one)
+        flights.append(one)
+    tell("flights", len(flights), len(kinds))
     return Evidence(
         asked=len(flown.seeds) + len(flown.unplanned),
         tubes=tubes,
         proved=proved,
         smaller=smaller,
         worst=Worst(**vars(target.record), flights=max(one.flights for one in found)),
-        flights=flights,
+        flights=tuple(flights),
         proof_seconds=proof_seconds,
         search_seconds=search_seconds,
         flight_seconds=watch.lap(),

@@ -14,6 +14,7 @@ import numpy as np
 
 from lagros_benchmarks.evidence.guaranteed import coordinates
 from lagros_benchmarks.evidence.single import Question, UnservedError
+from lagros_benchmarks.run.workers import Progress, untold
 from lagros_envs.dynamics import control_matrix
 from lagros_envs.task import Task
 from lagros_policies.contraction import BoxRegion, contraction_residual, load_metric
@@ -31,7 +32,7 @@ IDEAL = "u*"
 _CHECKS = 10_000
 
 
-def certify_metric(task: Task, question: Question) -> Certificate:
+def certify_metric(task: Task, question: Question, tell: Progress = untold) -> Certificate:
     """Return the certificate of a metric of a task of one body: a user's, or the task's own.
 
     Raises:
@@ -42,7 +43,9 @@ def certify_metric(task: Task, question: Question) -> Certificate:
     if question.largest:
         raise UnservedError(f"--largest: there is no proof for {task.name} whose region could grow")
     metric = _metric(task, question)
+    tell("proof", 0, 1)
     proved, bounds, missing = _proofs(task, metric, question.seconds)
+    tell("proof", 1, 1)
     # Those of W_bar are the inverses of those of M.
     most, least = (1.0 / value for value in extreme_eigenvalues(metric))
     gain = _sampled_gain(task, metric) if bounds is None else bounds.control_gain

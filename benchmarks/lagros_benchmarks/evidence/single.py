@@ -14,6 +14,7 @@ from lagros_benchmarks.evidence.loops import Loop, loop_named
 from lagros_benchmarks.evidence.predicted import prediction_of
 from lagros_benchmarks.evidence.records import recorded
 from lagros_benchmarks.evidence.words import headline, proved_lines, search_line
+from lagros_benchmarks.run.workers import Progress, untold
 from lagros_benchmarks.worst_case.seeds import CALIBRATION
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.task import Task
@@ -57,8 +58,13 @@ class Question:
     largest: bool = False
 
 
-def certify(task: Task, question: Question) -> Certificate:
+def certify(task: Task, question: Question, tell: Progress = untold) -> Certificate:
     """Return the certificate of the flights of a policy on a task of one body.
+
+    Args:
+        task: The task.
+        question: What is asked.
+        tell: Called with what is being done, how much of it is, and of how much.
 
     Raises:
         ValueError: The policy is unknown, or keeps a memory of its own.
@@ -66,8 +72,10 @@ def certify(task: Task, question: Question) -> Certificate:
         RuntimeError: No episode has a plan.
     """
     policy, bound = question.policy, question.bound
+    tell("plans", 0, 1)
     loop = loop_named(policy, task, episode_seeds(1, question.episodes, CALIBRATION))
-    found = evidence_of(loop, bound, KINDS, most_seconds=question.seconds)
+    tell("plans", 1, 1)
+    found = evidence_of(loop, bound, KINDS, most_seconds=question.seconds, tell=tell)
     flown, observed = flown_line(found, loop, policy, bound)
     proved = as_json(found, task)
     lines: list[Statement] = []

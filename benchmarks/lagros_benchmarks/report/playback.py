@@ -14,6 +14,7 @@ from lagros_benchmarks.report.video import FRAME_RATES, Frame, check_video_path,
 from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.room import room_of
 from lagros_benchmarks.run.settings import check_policy, unknown_name
+from lagros_benchmarks.run.workers import Progress, untold
 from lagros_envs.canvas import import_pygame
 from lagros_envs.checks import (
     check_disturbance_bound,
@@ -154,8 +155,11 @@ class Playback:
         self._stride = max(1, math.floor(per_second / wanted + 1e-9))
         self._rate = per_second * self._parts / self._stride
 
-    def play(self) -> bytes | None:
+    def play(self, tell: Progress = untold) -> bytes | None:
         """Play the episode: film it, or show it in the window until it is closed.
+
+        Args:
+            tell: Called with the control steps that are filmed, and those of the whole episode.
 
         Returns:
             The content of the video, or None.
@@ -166,7 +170,7 @@ class Playback:
         """
         if self.settings.video is not None:
             kind = self.settings.video.suffix.lower()
-            return video_bytes(kind, self._drawn(), self._rate)
+            return video_bytes(kind, self._drawn(tell), self._rate)
         self._show()
         return None
 
@@ -224,10 +228,10 @@ class Playback:
             lines.append(f"the policy raised, which counts as a failure: {self.error}")
         return lines
 
-    def _drawn(self) -> Iterator[Frame]:
+    def _drawn(self, tell: Progress) -> Iterator[Frame]:
         self._game.begin()
         self._game.open("rgb_array", self._rate)
-        for frame in self._frames():
+        for frame in self._frames(tell):
             yield frame
         for _ in range(round(_PAUSE * self._rate)):
             yield frame
@@ -247,12 +251,13 @@ class Playback:
             if pygame.event.get(pygame.QUIT):
                 break
 
-    def _frames(self) -> Iterator[Any]:
+    def _frames(self, tell: Progress = untold) -> Iterator[Any]:
         """Play the episode, and yield what is drawn of it: frames, or None from a window."""
         self.frames = 1
         yield self._game.draw(1.0)
         for step in range(1, self._steps + 1):
             over = self._game.step()
+            tell("film", self._steps if over else step, self._steps)
             if step % self._stride == 0 or over or step == self._steps:
                 for part in range(1, self._parts + 1):
                     self.frames += 1

@@ -14,6 +14,10 @@ Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
 
+def untold(title: str, done: int, total: int) -> None:
+    """Tell nobody: the `Progress` of who does not ask."""
+
+
 def gather(
     title: str,
     work: Callable[[Item], Outcome],
@@ -25,24 +29,23 @@ def gather(
 ) -> list[Outcome]:
     """Return the results of the work, in the order of the items, whatever the jobs.
 
-    `progress` is called with the title after every item. What `work` closes over travels to the
-    workers; one job works in this process. The keeper has what an earlier run has finished, and
-    takes what this one finishes.
+    `progress` is called with the title at once and after every item. What `work` closes over
+    travels to the workers; one job works in this process. The keeper has what an earlier run has
+    finished, and takes what this one finishes.
 
     Raises:
         BackendError: The backend is not installed, not reachable, or loses its workers.
     """
     joined: dict[int, Outcome] = {} if keeper is None else keeper.found(title, len(items))
     missing = [index for index in range(len(items)) if index not in joined]
-    if progress is not None and joined:
-        progress(title, len(joined), len(items))
+    tell = progress or untold
+    tell(title, len(joined), len(items))
     for one, outcome in each(work, [items[index] for index in missing], jobs, backend):
         index = missing[one]
         joined[index] = outcome
         if keeper is not None:
             keeper.add(title, index, outcome)
-        if progress is not None:
-            progress(title, len(joined), len(items))
+        tell(title, len(joined), len(items))
     return [joined[index] for index in range(len(items))]
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from lagros_benchmarks.run.files import plain, write_json
 from lagros_benchmarks.run.surroundings import machine, versions
+from lagros_benchmarks.run.workers import Progress, untold
 from lagros_benchmarks.training.c3m_run import C3mRun
 from lagros_benchmarks.training.evaluation import final_row
 from lagros_benchmarks.training.run import Place, check_same, digest_of
@@ -27,13 +28,14 @@ _CHECKPOINT = "progress.safetensors"
 _KINDS = "uniform", "constant"
 
 
-def train(run: C3mRun, place: Place, command: str = "") -> dict[str, Any]:
+def train(run: C3mRun, place: Place, command: str = "", tell: Progress = untold) -> dict[str, Any]:
     """Train, or go on with a run that was interrupted; a complete run is only read.
 
     Args:
         run: The run.
         place: Where it is kept.
         command: What prints the run again, for its record.
+        tell: Called with the epochs done and their number.
 
     Returns:
         The record, as it is written.
@@ -54,6 +56,7 @@ def train(run: C3mRun, place: Place, command: str = "") -> dict[str, Any]:
 
     def told(epoch: int, loss: float) -> None:
         _LOG.info("%s %d/%d: loss %.4g", place.folder, epoch, run.settings.epochs, loss)
+        tell(run.label, epoch, run.settings.epochs)
 
     networks, observed = fit_c3m(task, region, run.settings, checkpoint, told)
     spent = time.process_time() - begun

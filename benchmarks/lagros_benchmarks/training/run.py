@@ -28,6 +28,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from lagros_benchmarks.run.files import plain, write_atomic, write_json
 from lagros_benchmarks.run.surroundings import machine, versions
+from lagros_benchmarks.run.workers import Progress, untold
 from lagros_benchmarks.training.agent import make_agent
 from lagros_benchmarks.training.curves import AXES
 from lagros_benchmarks.training.settings import Training
@@ -96,7 +97,7 @@ def train(
     place: Place,
     lesson: Callable[[], Lesson],
     command: str = "",
-    progress: Callable[[int, int], None] | None = None,
+    tell: Progress = untold,
 ) -> dict[str, Any]:
     """Train, or go on with a run that was interrupted; a complete run is only read.
 
@@ -107,7 +108,7 @@ def train(
         place: Where it is kept.
         lesson: Makes the task's part; called unless the run is complete.
         command: What prints the run again, for its record.
-        progress: Called with the segments done and their number.
+        tell: Called with the segments done and their number.
 
     Returns:
         The record, as it is written.
@@ -127,6 +128,7 @@ def train(
         _LOG.info("%s: going on after segment %d", place.folder, len(curve))
     # A logger of our own even without outputs: the library's makes a folder in /tmp.
     model.set_logger(Logger(None, _outputs(place, model.num_timesteps)))
+    tell(training.label, len(curve), training.segments)
     for segment in range(len(curve), training.segments):
         begun = time.perf_counter(), time.process_time()
         made.begin(segment)
@@ -138,8 +140,7 @@ def train(
         model.logger.dump(model.num_timesteps)
         _save(place.checkpoint, settings, model, curve)
         _LOG.info("%s %d/%d: %s", place.folder, len(curve), training.segments, _words(curve[-1]))
-        if progress is not None:
-            progress(segment + 1, training.segments)
+        tell(training.label, segment + 1, training.segments)
     model.logger.close()
     made.save(model, place.weights)
     record = plain(_record(settings, curve, made.final(model), command))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
 from time import perf_counter
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from lagros_benchmarks.run.metrics import wilson_interval
 from lagros_benchmarks.run.room import room_of
 from lagros_benchmarks.run.settings import check_policy
+from lagros_benchmarks.run.workers import Progress, untold
 from lagros_benchmarks.worst_case.replay import Outcome, WorstCases
 from lagros_benchmarks.worst_case.search import MOST, Found, SearchSettings
 from lagros_benchmarks.worst_case.seeds import ATTACK
@@ -27,8 +27,6 @@ from lagros_envs.checks import (
 from lagros_envs.reading import Record
 from lagros_envs.registry import find_any, first_task
 from lagros_envs.seeding import episode_seeds
-
-Progress = Callable[[str], None]
 
 # What is to be broken where nothing is said.
 _GOAL = "success"
@@ -127,16 +125,21 @@ def run_attack(settings: AttackSettings, progress: Progress | None = None) -> At
     Raises:
         ValueError: The policy keeps a memory, or has no certificate to attack.
     """
-    say = progress or (lambda _: None)
+    tell = progress or untold
     bench = bench_of(settings.task)(settings)
-    bench.prepare(say)
+    tell("prepare", 0, 1)
+    bench.prepare()
+    tell("prepare", 1, 1)
     begun = perf_counter()
-    found = bench.search(say)
+    found = bench.search(tell)
     seconds = perf_counter() - begun
-    say("replaying")
     pushes = settings.bound * np.stack([one.sequence for one in found])
     check_bound(pushes, settings.bound)
-    outcomes, baseline = bench.replay(pushes), bench.replay(bench.random(_BASELINE))
+    tell("replay", 0, 2)
+    outcomes = bench.replay(pushes)
+    tell("replay", 1, 2)
+    baseline = bench.replay(bench.random(_BASELINE))
+    tell("replay", 2, 2)
     row = {**_row(settings, outcomes, baseline, found, seconds), **bench.figures()}
     largest = row.get("max_tracking_error_max")
     if largest is not None:
@@ -155,7 +158,7 @@ def fly_again(cases: WorstCases) -> list[Outcome]:
     check_bound(cases.pushes, settings.bound)
     bench = bench_of(settings.task)(settings)
     check_shape(cases.pushes, settings, bench.shape)
-    bench.prepare(lambda _: None)
+    bench.prepare()
     flown: list[Outcome] = bench.replay(cases.pushes)
     return flown
 

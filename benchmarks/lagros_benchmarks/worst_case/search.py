@@ -13,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
+from lagros_benchmarks.run.workers import Progress, untold
 from lagros_benchmarks.worst_case.optimisers import OPTIMISERS, make_search
 from lagros_benchmarks.worst_case.sequences import PARAMETRISATIONS
 from lagros_envs.arrays import FloatArray, IntArray
@@ -113,23 +114,38 @@ class Found:
 class _Pool:
     """The best sequences so far of every episode, best first, and what they cost."""
 
-    def __init__(self, target: Target, size: int) -> None:
+    def __init__(self, target: Target, size: int, budget: int, tell: Progress) -> None:
         self.size, self.flights = size, 0
+        self._budget, self._tell = budget, tell
+        tell("search", 0, budget)
         self.sequences = [np.empty((0, target.steps, target.channels))] * target.episodes
         self.scores = [np.empty(0)] * target.episodes
 
     def add(self, sequences: FloatArray, scores: FloatArray) -> None:
         """Take sequences (episodes, k, steps, channels) with their scores (episodes, k)."""
-        self.flights += scores.shape[1]
+        self.spend(scores.shape[1])
         for index, (fresh, values) in enumerate(zip(sequences, scores, strict=True)):
             joined = np.concatenate([self.scores[index], values])
             best = np.argsort(-joined, kind="stable")[: self.size]
             self.scores[index] = joined[best]
             self.sequences[index] = np.concatenate([self.sequences[index], fresh])[best]
 
+    def spend(self, flights: int) -> None:
+        """Count flights of each episode, and tell of them."""
+        self.flights += flights
+        self._tell("search", min(self.flights, self._budget), self._budget)
 
-def search(target: Target, settings: SearchSettings, seed: int = 0) -> list[Found]:
+
+def search(
+    target: Target, settings: SearchSettings, seed: int = 0, tell: Progress = untold
+) -> list[Found]:
     """Search the worst sequence of every episode of a target, each with its own stream of the seed.
+
+    Args:
+        target: What is attacked.
+        settings: How.
+        seed: Of the streams.
+        tell: Called with the flights per episode that are spent, and the budget.
 
     Raises:
         ValueError: The method is "gradient" and the target has no slopes.
@@ -139,7 +155,7 @@ def search(target: Target, settings: SearchSettings, seed: int = 0) -> list[Foun
         raise ValueError("method='gradient' needs a target with slopes; use 'hybrid'")
     children = np.random.SeedSequence(seed).spawn(target.episodes)
     streams = [np.random.default_rng(child) for child in children]
-    pool = _Pool(target, settings.restarts)
+    pool = _Pool(target, settings.restarts, settings.budget, tell)
     _try(target, pool, target.starts()[:, : settings.budget])
     if settings.method == "gradient":
         _try(target, pool, _random_starts(target, settings.restarts, streams))
@@ -149,6 +165,7 @@ def search(target: Target, settings: SearchSettings, seed: int = 0) -> list[Foun
         _explore(target, settings, name, pool, streams, share * settings.budget)
     if climbs:
         _climb(target, pool, settings.budget)
+    tell("search", settings.budget, settings.budget)
     return [
         Found(sequences[0], float(scores[0]), pool.flights)
         for sequences, scores in zip(pool.sequences, pool.scores, strict=True)
@@ -230,7 +247,7 @@ def _climb(target: Target, pool: _Pool, budget: int) -> None:
         rows, columns = np.ogrid[: target.episodes, :count]
         chosen = moved.reshape(*each.shape, target.steps, target.channels)[rows, columns, best]
         gained = each[rows, columns, best] > before + 1e-9
-        pool.flights += cost
+        pool.spend(cost)
         for index in range(target.episodes):
             kept = np.where(gained[index][:, None, None], chosen[index], here[index])
             values = np.where(

@@ -14,6 +14,7 @@ from lagros_benchmarks.run.closed_loop import ClosedLoop
 from lagros_benchmarks.run.episodes import TUBE_TOLERANCE
 from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.library import make_single_policy
+from lagros_benchmarks.run.workers import Progress
 from lagros_benchmarks.worst_case.aimed import aimed_sequences
 from lagros_benchmarks.worst_case.flights import (
     Episodes,
@@ -171,9 +172,8 @@ class SingleBench:
                 f"safety_filter=True is for worlds of many agents; leave it out for {settings.task}"
             )
 
-    def prepare(self, say: Callable[[str], None]) -> None:
+    def prepare(self) -> None:
         """Build everything, and plan the episodes."""
-        say("planning")
         env: Any = gym.make(self.task.env_id, disable_env_checker=True)
         name = self.settings.policy
         ClosedLoop(env, make_single_policy(name, env)).rehearse(f"policy {name!r}")
@@ -192,9 +192,8 @@ class SingleBench:
         if self.metric is not None:
             self._tracked = self.expert.track(self.episodes.plans, self.episodes.controls)
 
-    def search(self, say: Callable[[str], None]) -> list[Found]:
+    def search(self, tell: Progress) -> list[Found]:
         """Search the worst sequence of every episode."""
-        say("searching")
         # For tube MPC u* around its plan, which it keeps.
         tracked = tracking_law(self.expert, self.episodes) if self.tracks else None
         target = SingleTarget(
@@ -204,7 +203,7 @@ class SingleBench:
             self.settings.bound,
             None if self.metric is None else energy_adversary(self.metric),
         )
-        return search(target, self.settings.search, self.settings.seed)
+        return search(target, self.settings.search, self.settings.seed, tell)
 
     def random(self, kind: str) -> FloatArray:
         """Return the random disturbance of every episode, shape (episodes, steps, n)."""

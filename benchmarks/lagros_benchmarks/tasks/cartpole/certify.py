@@ -11,6 +11,7 @@ import numpy as np
 import lagros_policies
 from lagros_benchmarks.evidence.metric import IDEAL
 from lagros_benchmarks.evidence.single import Question
+from lagros_benchmarks.run.workers import Progress, untold
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_policies.contraction import Metric, load_metric
 from lagros_policies.contraction.certificate import Certificate
@@ -31,7 +32,9 @@ _HUNDREDTHS = 100
 _LARGEST = 150
 
 
-def certify_metric(task: CartPoleSettings, question: Question) -> Certificate:
+def certify_metric(
+    task: CartPoleSettings, question: Question, tell: Progress = untold
+) -> Certificate:
     """Return the certificate of a metric of the cart-pole: a user's, or the one that is proved.
 
     Raises:
@@ -40,6 +43,7 @@ def certify_metric(task: CartPoleSettings, question: Question) -> Certificate:
     """
     file, large = metric_to_prove(question.metric)
     metric = load_cartpole_metric(file)
+    tell("proof", 0, 1)
     box, proofs = (
         largest_proofs(metric, question.seconds)
         if question.largest
@@ -53,6 +57,7 @@ def certify_metric(task: CartPoleSettings, question: Question) -> Certificate:
         policy=IDEAL,
         most_seconds=question.seconds,
     )
+    tell("proof", 1, 1)
     return cartpole_certificate(task.system, metric, asked, proofs)
 
 

@@ -7,7 +7,6 @@ until the environment ended it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from lagros_benchmarks.run.flying import AnswerError, Attempt, ask
 from lagros_benchmarks.run.library import make_single_policy
+from lagros_benchmarks.run.workers import Progress
 from lagros_benchmarks.tasks.foreign.loop import ForeignLoop, fly
 from lagros_benchmarks.worst_case.flights import UnfitError
 from lagros_benchmarks.worst_case.replay import Outcome
@@ -180,7 +180,7 @@ class ForeignBench:
                 f"safety_filter=True is for worlds of many agents; leave it out for {settings.task}"
             )
 
-    def prepare(self, say: Callable[[str], None]) -> None:
+    def prepare(self) -> None:
         """Build the policy.
 
         Raises:
@@ -194,12 +194,11 @@ class ForeignBench:
         self.policy = make_single_policy(name, env)
         ForeignLoop(env, self.policy).rehearse(f"policy {name!r}")
 
-    def search(self, say: Callable[[str], None]) -> list[Found]:
+    def search(self, tell: Progress) -> list[Found]:
         """Search the worst sequence of every episode."""
-        say("searching")
         goal, bound = self.settings.goal, self.settings.bound
         target = ForeignTarget(self.task, self.policy, goal, bound, self.seeds, self.channels)
-        found = search(target, self.settings.search, self.settings.seed)
+        found = search(target, self.settings.search, self.settings.seed, tell)
         target.close()
         return [replace(one, sequence=target.whole(one.sequence)) for one in found]
 

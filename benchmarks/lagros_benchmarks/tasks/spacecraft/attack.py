@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from lagros_benchmarks.run.flying import Attempt
 from lagros_benchmarks.run.library import building, make_single_policy
+from lagros_benchmarks.run.workers import Progress
 from lagros_benchmarks.tasks.spacecraft.claims import position_margin
 from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, make_filter
 from lagros_benchmarks.tasks.spacecraft.plane import worst_plane_pushes
@@ -67,7 +67,7 @@ class SpacecraftBench:
                 "--method out"
             )
 
-    def prepare(self, say: Callable[[str], None]) -> None:
+    def prepare(self) -> None:
         """Build everything that flies."""
         self._targets = self.targets()
 
@@ -98,11 +98,11 @@ class SpacecraftBench:
             for seed in settings.episode_seeds()
         ]
 
-    def search(self, say: Callable[[str], None]) -> list[Found]:
+    def search(self, tell: Progress) -> list[Found]:
         """Search the worst sequence of every world."""
-        found = []
+        found: list[Found] = []
         for number, target in enumerate(self._targets):
-            say(f"world {number + 1} of {len(self._targets)}")
+            tell("worlds", number, len(self._targets))
             rng = np.random.default_rng([self.settings.seed, number])
             one = search_adversary(target, self.settings.search, rng)
             if target.goal == "tube":
@@ -111,6 +111,7 @@ class SpacecraftBench:
                 worse = known if known.score > one.score else one
                 one = replace(worse, flights=one.flights + 1)
             found.append(one)
+        tell("worlds", len(found), len(found))
         return found
 
     def random(self, kind: str) -> FloatArray:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lagros_benchmarks.evidence.calibration import EpisodeScores, Score
+from lagros_benchmarks.run.workers import Progress, untold
 from lagros_benchmarks.tasks.spacecraft.episodes import fly_chunk, make_worlds
 from lagros_benchmarks.worst_case.seeds import CALIBRATION
 from lagros_envs.seeding import episode_seeds
@@ -30,10 +31,12 @@ def spacecraft_scores(
     preset: str = "paper",
     agents: int = 6,
     policy: str = "centralized",
+    tell: Progress = untold,
 ) -> EpisodeScores:
     """Fly worlds of a centralised policy and return the largest position error of each.
 
-    See `evidence.calibration.single_scores`; preset and agents are those of the worlds.
+    See `evidence.calibration.single_scores`; preset and agents are those of the worlds, of which
+    as many as have flown are told.
     """
     begun = perf_counter()
 
@@ -44,10 +47,12 @@ def spacecraft_scores(
     seeds = episode_seeds(seed, count, namespace)
     scores = []
     for at in range(0, count, _WORLDS):
+        tell("calibration", at, count)
         for world in fly_chunk(worlds, flown, seeds[at : at + _WORLDS]).worlds:
             errors = [agent.max_position_error for agent in world.agents]
             whole = world.error is None and world.planned and None not in errors
             scores.append(max(e for e in errors if e is not None) if whole else np.inf)
+    tell("calibration", count, count)
     values = np.array(scores)
     failed = int(np.count_nonzero(np.isinf(values)))
     return EpisodeScores({POSITION_ERROR.name: values}, failed, perf_counter() - begun)

@@ -14,6 +14,7 @@ from typing import Any
 
 from lagros_benchmarks.evidence.calibration import calibrated, conditions
 from lagros_benchmarks.evidence.single import KINDS, LEAST, LEVEL, Question, UnservedError
+from lagros_benchmarks.run.workers import Progress, untold
 from lagros_benchmarks.tasks.spacecraft import guaranteed
 from lagros_benchmarks.tasks.spacecraft.calibration import (
     POSITION_ERROR,
@@ -40,7 +41,7 @@ _AGENTS, _PRESET = 6, "paper"
 _WORLDS = 25
 
 
-def certify(task: SpacecraftSettings, question: Question) -> Certificate:
+def certify(task: SpacecraftSettings, question: Question, tell: Progress = untold) -> Certificate:
     """Return the spacecraft's certificate; what is proved of its law takes milliseconds.
 
     Raises:
@@ -53,7 +54,7 @@ def certify(task: SpacecraftSettings, question: Question) -> Certificate:
     if question.metric is not None:
         return _of_a_metric(task, question, question.metric)
     if question.policy == "lagros":
-        return _of_the_network(task, question)
+        return _of_the_network(task, question, tell)
     policy, bound, count = question.policy, question.bound, question.episodes
     flown: Any = make(policy, make_worlds(1, _AGENTS, _PRESET, "none", bound))
     law = flown.tracking
@@ -69,11 +70,12 @@ def certify(task: SpacecraftSettings, question: Question) -> Certificate:
     )
     if count == 0:
         return found
-    evidence = guaranteed.world_evidence(policy, bound, episode_seeds(1, count, EVALUATION))
+    seeds = episode_seeds(1, count, EVALUATION)
+    evidence = guaranteed.world_evidence(policy, bound, seeds, tell=tell)
     assert evidence is not None  # the policies of the question track with a gain
     lines = guaranteed.lines(evidence, bound)
     if count >= LEAST:
-        scores = spacecraft_scores(count, kind=KINDS[0], bound=bound, policy=policy)
+        scores = spacecraft_scores(count, kind=KINDS[0], bound=bound, policy=policy, tell=tell)
         lines += calibrated((POSITION_ERROR,), scores, LEVEL, conditions(KINDS[0], bound))
     found = replace(
         found,
@@ -97,7 +99,7 @@ def _of_a_metric(task: SpacecraftSettings, question: Question, path: Path) -> Ce
     )
 
 
-def _of_the_network(task: SpacecraftSettings, question: Question) -> Certificate:
+def _of_the_network(task: SpacecraftSettings, question: Question, tell: Progress) -> Certificate:
     """Return what is calibrated and observed of `lagros`, beside what its labels' metric is."""
     period, bound, count = task.control_period, question.bound, question.episodes
     line = _labels(task, question.policy)
@@ -117,7 +119,9 @@ def _of_the_network(task: SpacecraftSettings, question: Question) -> Certificate
         "labels, follows no plan, and what is said of it is calibrated or observed",
         not_proved=("any bound for lagros: no tube surrounds what follows no plan",),
     ).with_evidence([line])
-    return found.with_evidence([_share_of_worlds(question.policy, bound, count)] if count else [])
+    if not count:
+        return found
+    return found.with_evidence([_share_of_worlds(question.policy, bound, count, tell)])
 
 
 def _labels(task: SpacecraftSettings, policy: str) -> Statement:
@@ -139,7 +143,7 @@ def _labels(task: SpacecraftSettings, policy: str) -> Statement:
     return Statement(text, "observed", True, 0.0)
 
 
-def _share_of_worlds(policy: str, bound: float, count: int) -> Statement:
+def _share_of_worlds(policy: str, bound: float, count: int, tell: Progress) -> Statement:
     """Fly worlds, and bound the share of fresh ones in which all arrive and nobody collides."""
     from scipy.stats import beta
 
@@ -148,6 +152,7 @@ def _share_of_worlds(policy: str, bound: float, count: int) -> Statement:
     flown = make(policy, make_worlds(1, _AGENTS, _PRESET, KINDS[0], bound))
     whole = 0
     for at in range(0, count, _WORLDS):
+        tell("worlds", at, count)
         flight = fly_chunk(
             lambda number: make_worlds(number, _AGENTS, _PRESET, KINDS[0], bound),
             flown,
@@ -157,6 +162,7 @@ def _share_of_worlds(policy: str, bound: float, count: int) -> Statement:
             world.error is None and all(one.success and not one.collided for one in world.agents)
             for world in flight.worlds
         )
+    tell("worlds", count, count)
     least = float(beta.ppf(1.0 - LEVEL, whole, count - whole + 1)) if whole else 0.0
     text = (
         f"{policy}, {conditions(KINDS[0], bound)}: all agents arrive and none collides in {whole} "

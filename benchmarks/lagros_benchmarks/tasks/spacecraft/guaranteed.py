@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lagros_benchmarks.run.workers import Progress, untold
 from lagros_benchmarks.tasks.spacecraft.aimed import Aimed
 from lagros_benchmarks.tasks.spacecraft.claims import tracked_with_a_gain
 from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, make_worlds
@@ -74,7 +76,12 @@ class Evidence:
 
 
 def world_evidence(
-    name: str, bound: float, seeds: Sequence[int], preset: str = "paper", agents: int = 6
+    name: str,
+    bound: float,
+    seeds: Sequence[int],
+    preset: str = "paper",
+    agents: int = 6,
+    tell: Progress = untold,
 ) -> Evidence | None:
     """Prove what can be proved of worlds, and search for what is worst in them.
 
@@ -88,6 +95,7 @@ def world_evidence(
         seeds: Of the worlds.
         preset: Theirs.
         agents: In each.
+        tell: Called with the flights of batches of worlds that are done, and how many there are.
 
     Returns:
         The evidence; None for a policy that tracks no joint plan with a gain.
@@ -98,11 +106,14 @@ def world_evidence(
     found: list[WorldGuarantee | None] = []
     batches: list[list[Any]] = []
     proving = searching = 0.0
+    each = len(_AIMS) + len(_KINDS)
+    whole = each * math.ceil(len(seeds) / _WORLDS)
     for at in range(0, len(seeds), _WORLDS):
         some = [int(seed) for seed in seeds[at : at + _WORLDS]]
         flights: list[tuple[Any, ...]] = []
         memory: Any = None
         for disturbance in disturbances(policy, bound):
+            tell("flights", each * len(batches) + len(flights), whole)
             begun = time.monotonic()
             env = make_worlds(len(some), agents, preset, disturbance, bound)
             flight, memory = _fly(env, policy, some, memory)
@@ -112,13 +123,14 @@ def world_evidence(
         found += [_proved(env, policy, world, one, bound) for world, one in enumerate(memory)]
         proving += time.monotonic() - begun
         batches.append([np.stack(part).max(axis=0) for part in zip(*flights, strict=True)])
+    tell("flights", whole, whole)
     error, collided, missed = (np.concatenate(part) for part in zip(*batches, strict=True))
     return Evidence(
         tuple(found),
         error,
         collided,
         missed,
-        flights=len(_AIMS) + len(_KINDS),
+        flights=each,
         proof_seconds=proving,
         search_seconds=searching,
     )
