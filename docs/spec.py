@@ -21,7 +21,7 @@ from lagros_envs.task import Task
 from lagros_envs.tasks import SHIPPED
 from lagros_envs.tasks.spacecraft.scenarios import PRESETS
 from lagros_envs.tasks.spacecraft.sensing import Layout
-from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings, settings_for
 
 PAGES = Path(__file__).parent / "systems"
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
@@ -126,19 +126,31 @@ def _facts_of_many(task: SpacecraftSettings) -> Iterator[str]:
 
 
 def _presets(task: SpacecraftSettings) -> Iterator[str]:
-    yield "| preset | agents | arena [m] | obstacles | radius [m]: obstacle, agent, to obstacles |"
-    yield "|---|---:|---:|---:|---:|"
+    yield (
+        "| preset | agents n | arena [m] | obstacles | radius [m]: obstacle, agent, to obstacles "
+        "| T, time limit [s] | other |"
+    )
+    yield "|---|---:|---:|---:|---:|---:|---|"
     for name in task.presets:
         preset = PRESETS[name]
-        fewest, most = preset.obstacle_count
+        own = settings_for(preset)
+        grown = f" · n/{preset.agents}" if preset.grows else ""
         arena = f"{preset.arena:g}" + (f" · √(n/{preset.agents})" if preset.grows else "")
         if preset.layout == "antipodal":
             arena = "a circle, each goal opposite"
+        fewest, most = preset.obstacle_count
         count = f"{fewest} to {most}" if fewest < most else f"{most}"
-        count += f", · n/{preset.agents}" if preset.grows else ""
+        if most:
+            count = f"({count}){grown}" if grown else count
+        times = f"{own.horizon:g}, {own.time_limit:g}"
+        if preset.slows:
+            times = f"({times}) · √(n/{preset.agents})"
+        given = dict(preset.task)
+        other = [f"{key} {given[key]:g}" for key in given if key not in ("horizon", "time_limit")]
         yield (
-            f"| `{name}` | {preset.agents} | {arena} | {count} | {preset.obstacle_radius:g}, "
-            f"{preset.agent_radius:g}, {preset.core:g} |"
+            f"| `{name}` | {preset.agents} | {arena} | {count} | "
+            f"{preset.obstacle_radius:.3g}, {preset.agent_radius:g}, {preset.core:g} | {times} | "
+            f"{', '.join(other) or '–'} |"
         )
 
 
