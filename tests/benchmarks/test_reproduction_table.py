@@ -11,6 +11,7 @@ from studies import reproduction_table as page
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reproduction.md"
+DERIVATIONS = ROOT / "benchmarks" / "studies" / "reproduction.md"
 
 
 def cartpole_row(policy, **values):
@@ -109,8 +110,8 @@ def test_published_rates_belong_to_270_agents():
 
 
 def snippet(first_words):
-    """Return the indented program of the page that begins so."""
-    text = PAGE.read_text()
+    """Return the indented program of the derivations that begins so."""
+    text = DERIVATIONS.read_text()
     found = re.search(rf"^( +){re.escape(first_words)}.*\n(?:\1.*\n)+", text, re.MULTILINE)
     assert found is not None
     return dedent(found[0])
@@ -121,7 +122,9 @@ def test_the_least_condition_number_at_the_upright(capsys):
     exec(snippet("from lagros_policies.contraction import"), {})
     found = np.array(capsys.readouterr().out.split(), dtype=float).reshape(-1, 2)
     bounds, weights = (
-        np.array(re.search(rf"{name} = ([\d.e+, ]+\d)", PAGE.read_text())[1].split(","), float)
+        np.array(
+            re.search(rf"{name} = ([\d.e+, ]+\d)", DERIVATIONS.read_text())[1].split(","), float
+        )
         for name in ("prints χ", "and ν")
     )
     assert found[:, 0] == pytest.approx(bounds, rel=2e-3)
