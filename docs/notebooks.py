@@ -2,8 +2,10 @@
 
     python docs/notebooks.py             # which are not as their page is; status 1 if any is not
     python docs/notebooks.py --update    # and write them
+    python docs/notebooks.py --run       # run them, each in an empty folder; needs lagros[docs]
 
-Blocks of Python become cells, commands become cells that begin with `!`.
+Blocks of Python become cells, commands become cells that begin with `!`. What needs a file of the
+project beside the notebook stays text.
 """
 
 from __future__ import annotations
@@ -13,6 +15,8 @@ import hashlib
 import json
 import re
 import sys
+import tempfile
+import time
 import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -35,13 +39,22 @@ _PIECES = re.compile(
 _WRITTEN = re.compile(r"[Ww]rite\s+`(\w+\.py)`:$")
 # What only makes the environment that the notebook already runs in.
 _INSTALLS = ("make", "pip", "source")
+# Where the pages' files of the project lie, which a notebook does not have.
+_PROJECT = "examples/"
+# What opens notebooks of this host, and of no other.
+_HOST = "https://github.com/"
+_COLAB, _BINDER = "https://colab.research.google.com", "https://mybinder.org"
+# What a notebook may take on two cores [s].
+_PATIENCE = 600
 
 
 def notebook(name: str) -> str:
     """Return the text of a notebook."""
     page = PAGES[name]
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")
-    cells = [*_install(name), *_cells(text, Path(page))]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    address = project["tool"]["hatch"]["metadata"]["hooks"]["custom"]["repository"]
+    cells = [*_install(name, address), *_cells(text, Path(page))]
     for number, cell in enumerate(cells):
         cell["id"] = hashlib.sha256(f"{name} {number}".encode()).hexdigest()[:8]
     found = {
@@ -56,19 +69,26 @@ def notebook(name: str) -> str:
     return json.dumps(found, indent=1, ensure_ascii=False) + "\n"
 
 
-def _install(name: str) -> Iterator[dict[str, Any]]:
-    """Yield the first cells: how a stranger comes by the package."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    address = project["tool"]["hatch"]["metadata"]["hooks"]["custom"]["repository"]
+def _install(name: str, address: str) -> Iterator[dict[str, Any]]:
+    """Yield the first cells: how a stranger comes by the package, from where it is published."""
     if not address:
         yield _markdown(
             'Needs `pip install -c constraints.txt ".[bench,rl]"` in the folder of the project.\n'
         )
         return
-    path = f"{address.removeprefix('https://github.com/')}/blob/main/notebooks/{name}.ipynb"
-    colab = "https://colab.research.google.com"
-    yield _markdown(f"[![Open in Colab]({colab}/assets/colab-badge.svg)]({colab}/github/{path})\n")
-    yield _code(f'%pip install "lagros[bench,rl] @ git+{address}"')
+    install = f'%pip install -q "lagros[bench,rl] @ git+{address}"'
+    project = address.removeprefix(_HOST)
+    if project == address:
+        yield _markdown(f"Needs `{install.removeprefix('%')}`.\n")
+        return
+    path = f"notebooks/{name}.ipynb"
+    colab = f"{_COLAB}/github/{project}/blob/main/{path}"
+    binder = f"{_BINDER}/v2/gh/{project}/main?labpath={path}"
+    yield _markdown(
+        f"[![Open in Colab]({_COLAB}/assets/colab-badge.svg)]({colab})\n"
+        f"[![Open in Binder]({_BINDER}/badge_logo.svg)]({binder})\n"
+    )
+    yield _code(install)
 
 
 def _cells(text: str, page: Path) -> Iterator[dict[str, Any]]:
@@ -89,7 +109,7 @@ def _piece(piece: re.Match[str], page: Path, magic: str) -> Iterator[dict[str, A
     elif piece["indented"] or piece["kind"] == "console":
         block = piece["indented"] or piece["fenced"]
         lines = [line.strip() for line in block.splitlines() if line.strip()]
-        runs = [line for line in lines if line.split()[0] not in _INSTALLS]
+        runs = [line for line in lines if line.split()[0] not in _INSTALLS and _PROJECT not in line]
         if runs:
             yield _code("\n".join(f"!{line}" for line in runs))
         else:
@@ -121,11 +141,50 @@ def _code(text: str) -> dict[str, Any]:
     }
 
 
+def run(name: str, folder: Path) -> Iterator[tuple[float, str]]:
+    """Run a notebook in a folder; yield the seconds and the first line of every cell of code.
+
+    Raises:
+        nbclient.exceptions.CellExecutionError: A cell raised, or one of its commands failed.
+        nbclient.exceptions.CellTimeoutError: A cell took longer than a whole notebook may.
+    """
+    import nbformat
+    from nbclient import NotebookClient
+
+    book = nbformat.reads(notebook(name), as_version=4)
+    client = NotebookClient(book, timeout=_PATIENCE, resources={"metadata": {"path": str(folder)}})
+    with client.setup_kernel():
+        for number, cell in enumerate(book.cells):
+            if cell.cell_type != "code" or cell.source.startswith("%pip"):
+                continue
+            title = cell.source.partition("\n")[0]
+            # A command that fails raises nothing by itself.
+            cell.source = re.sub(r"^!.*$", r"\g<0>\nassert not _exit_code", cell.source, flags=re.M)
+            begun = time.perf_counter()
+            client.execute_cell(cell, number)
+            yield time.perf_counter() - begun, title
+
+
+def _run_all(names: Sequence[str]) -> None:
+    for name in names:
+        print(name, flush=True)
+        begun = time.perf_counter()
+        with tempfile.TemporaryDirectory() as folder:
+            for seconds, title in run(name, Path(folder)):
+                print(f"{seconds:7.1f} s {title}", flush=True)
+        print(f"{time.perf_counter() - begun:7.1f} s in all, of {_PATIENCE} s", flush=True)
+
+
 def main(arguments: Sequence[str] | None = None) -> str | None:
-    """Compare or write the notebooks; return what is wrong."""
+    """Compare, write or run the notebooks; return what is wrong."""
     parser = argparse.ArgumentParser(description="Notebooks of the tutorial.")
     parser.add_argument("--update", action="store_true", help="write the notebooks")
-    update = parser.parse_args(arguments).update
+    parser.add_argument("--run", nargs="*", metavar="NAME", help="run those that are named, or all")
+    given = parser.parse_args(arguments)
+    if given.run is not None:
+        _run_all(given.run or list(PAGES))
+        return None
+    update = given.update
     stale = []
     for name in PAGES:
         path, wanted = FOLDER / f"{name}.ipynb", notebook(name)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
+import sys
+from pathlib import Path
 from typing import NamedTuple
 
 # The words that a line to type begins with.
@@ -21,6 +24,18 @@ class Command(NamedTuple):
 
     line: int
     words: tuple[str, ...]
+
+
+def environment() -> dict[str, str]:
+    """Return variables with which what the pages say runs the code of this folder."""
+    root = Path(__file__).resolve().parents[1]
+    modules = [str(root), str(root / "benchmarks"), os.environ.get("PYTHONPATH", "")]
+    programs = [str(Path(sys.executable).parent), os.environ["PATH"]]
+    return os.environ | {
+        "PATH": os.pathsep.join(programs),
+        "PYTHONPATH": os.pathsep.join(modules),
+        "SDL_VIDEODRIVER": "dummy",
+    }
 
 
 def python_blocks(text: str) -> list[str]:

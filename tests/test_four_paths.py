@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from pathlib import Path
 
 import pytest
 
-from tests import four_paths
+from tests import documents, four_paths
 from tests.four_paths import PATHS, Step
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize("name", PATHS)
@@ -55,8 +51,6 @@ def test_a_step_must_end_well_and_show_what_it_should(
 def test_a_path_leads_where_it_should(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    programs = str(Path(sys.executable).parent)
-    paths = [str(ROOT), str(ROOT / "benchmarks"), os.environ.get("PYTHONPATH", "")]
-    monkeypatch.setenv("PATH", programs + os.pathsep + os.environ["PATH"])
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+    for variable, value in documents.environment().items():
+        monkeypatch.setenv(variable, value)
     four_paths.walk(name, tmp_path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import re
 import subprocess
 import sys
@@ -19,7 +18,12 @@ from tests.benchmarks import browser
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-TUTORIAL = sorted((DOCS / "tutorial").glob("*.md"))
+# The others are run as notebooks (test_notebooks.py).
+TUTORIAL = [
+    page
+    for page in sorted((DOCS / "tutorial").glob("*.md"))
+    if not (ROOT / "notebooks" / f"{page.stem}.ipynb").is_file()
+]
 # What would install, open a window or need a compiler.
 _NOT_RUN = ("make", "pip", "source", "git")
 
@@ -124,15 +128,9 @@ def test_a_page_of_the_tutorial_runs_as_it_stands(page: Path, tmp_path: Path) ->
     blocks = documents.python_blocks(text)
     (tmp_path / "blocks.py").write_text("\n\n".join(blocks), encoding="utf-8")
     typed = [command.words for command in documents.commands(text)]
-    programs = str(Path(sys.executable).parent)
-    paths = [str(ROOT), str(ROOT / "benchmarks"), os.environ.get("PYTHONPATH", "")]
-    env = os.environ | {
-        "PATH": programs + os.pathsep + os.environ["PATH"],
-        "PYTHONPATH": os.pathsep.join(paths),
-        "SDL_VIDEODRIVER": "dummy",
-    }
     for words in [("python", "blocks.py"), *typed]:
         if words[0] not in _NOT_RUN:
+            env = documents.environment()
             subprocess.run(words, cwd=tmp_path, env=env, check=True, stdin=subprocess.DEVNULL)
 
 
