@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -50,7 +51,9 @@ def _facts(task: Task) -> Iterator[str]:
             else " |"
         )
     )
+    yield f"| action | `Box(-1, 1, ({task.system.control_dim},), float32)`, scaled as below |"
     yield f"| control period, time limit | {task.control_period:g} s, {task.time_limit:g} s |"
+    yield f"| terminated | {_ends(task)}; arriving ends nothing |"
     radius = float(task.success_radius(task.time_limit))
     yield f"| success | within {radius:.3g} of the goal, and neither fallen nor in touch |"
     bounds = ", ".join(f"{bound:g}" for bound in task.defaults.bounds)
@@ -62,6 +65,17 @@ def _facts(task: Task) -> Iterator[str]:
     )
     if task.presets:
         yield f"| presets | {', '.join(f'`{name}`' for name in task.presets)} |"
+
+
+def _ends(task: Task) -> str:
+    """Return when an episode is terminated, in the words of the task's own docstring."""
+    ends = []
+    said = re.match(r"Return by how much (.+?)(?: \[|[,:]|\.$)", type(task).excess.__doc__ or "")
+    if type(task).excess is not Task.excess and said:
+        ends.append(f"when {said[1]}")
+    if task.most_discs:
+        ends.append("when a disc is touched")
+    return ", or ".join(ends) or "never before the time limit"
 
 
 def _coordinates(task: Task) -> Iterator[str]:
