@@ -18,6 +18,7 @@ from lagros_envs.numbers.functions import exp, maximum, minimum
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.learning.deep_set import Elements, SetFeatures
 from lagros_policies.tasks.spacecraft.pace import time_to_go
+from lagros_policies.tasks.spacecraft.receding import Receding
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 
 OWN = (
@@ -88,8 +89,23 @@ def body_features(apart: Any, motion: Any, touch: Any, rim: Any) -> tuple[Any, A
     return values, weight
 
 
+def shown_goal(goal: Any, left: Any, receding: Receding | None) -> tuple[Any, Any]:
+    """Return the goal that a network is shown, and the time that is left for it [s].
+
+    Args:
+        goal: Relative to the agent, a vector [m].
+        left: Until the horizon [s].
+        receding: How far goals are shown; None for all the way.
+    """
+    return (goal, left) if receding is None else receding.shown(goal)
+
+
 def spacecraft_features(
-    sensed: Sensed, settings: SpacecraftSettings, agent_radius: float, core_radius: float
+    sensed: Sensed,
+    settings: SpacecraftSettings,
+    agent_radius: float,
+    core_radius: float,
+    receding: Receding | None = None,
 ) -> SetFeatures:
     """Return the inputs of the networks; the frame is that of the goal.
 
@@ -98,11 +114,11 @@ def spacecraft_features(
         settings: The task.
         agent_radius: Radius of every agent against the others [m].
         core_radius: Radius against obstacles [m].
+        receding: As for `shown_goal`.
     """
     course, left = _complex(sensed.velocity), settings.horizon - sensed.time
-    own, frame = own_features(
-        _complex(sensed.goal), course, sensed.heading_change, sensed.spin, left
-    )
+    goal, left = shown_goal(_complex(sensed.goal), left, receding)
+    own, frame = own_features(goal, course, sensed.heading_change, sensed.spin, left)
     back = frame.conj()
     # Neighbours first, then obstacles: one table for both.
     whose, slot = sensed.neighbour_mask.nonzero()

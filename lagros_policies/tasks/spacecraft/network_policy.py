@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,6 +20,7 @@ from lagros_policies.observed import as_numbers
 from lagros_policies.policy import BasePolicy, PolicyState
 from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.spacecraft.features import NEIGHBOUR, OBSTACLE, OWN, spacecraft_features
+from lagros_policies.tasks.spacecraft.receding import COUNTERS, Receding, Waiting
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.setup import (
     PUBLISHED,
@@ -85,12 +89,16 @@ class SpacecraftActor(BasePolicy):
             self.network.metadata,
             what,
             self.recorded_as,
-            # Who sees no further than its neighbours is not tied to their number.
-            task.before_growth(self.settings, self.preset),
+            self._looked_at(),
             spacecraft_range(task.SpacecraftSettings(), self.trained_in),
             allow_other_settings,
             radii_of(self.preset),
         )
+
+    def _looked_at(self) -> task.SpacecraftSettings:
+        """Return the settings that are held against those of the training."""
+        # Who sees no further than its neighbours is not tied to their number.
+        return task.before_growth(self.settings, self.preset)
 
 
 class SpacecraftNetworkPolicy(SpacecraftActor):
@@ -98,6 +106,16 @@ class SpacecraftNetworkPolicy(SpacecraftActor):
 
     The network answers with an acceleration in the frame of the goal; a turn into the body's axes
     and a fixed last layer with ReLU, the allocation of least norm, make u >= 0 of it.
+
+    Args:
+        receding: Whether goals are shown as receding ones, with the rule against deadlocks: True or
+            False, a `Receding` or a mapping of its fields; None for yes where worlds are larger
+            than those in which the networks learned, `Receding.chosen`.
+        others: As of `SpacecraftActor`.
+
+    Raises:
+        FileNotFoundError: As of `SpacecraftActor`.
+        ValueError: As of `SpacecraftActor`, or `receding` is none of these.
     """
 
     name: str = "network"
@@ -108,6 +126,27 @@ class SpacecraftNetworkPolicy(SpacecraftActor):
     maker = "lagros reproduce spacecraft"
     network: DeepSet
 
+    def __init__(
+        self,
+        *others: Any,
+        receding: Receding | Mapping[str, float] | bool | None = None,
+        **named: Any,
+    ) -> None:
+        self._asked = receding
+        super().__init__(*others, **named)
+
+    @cached_property
+    def receding(self) -> Receding | None:
+        """How far goals are shown; None for all the way."""
+        return Receding.chosen(self._asked, self.preset)
+
+    def _looked_at(self) -> task.SpacecraftSettings:
+        # Who is always shown the same time is not tied to T or to the end of an episode.
+        if self.receding is None:
+            return super()._looked_at()
+        usual = task.SpacecraftSettings()
+        return replace(self.settings, horizon=usual.horizon, time_limit=usual.time_limit)
+
     def predict(
         self,
         observation: Float32Array,
@@ -115,14 +154,56 @@ class SpacecraftNetworkPolicy(SpacecraftActor):
         episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, PolicyState]:
-        """Evaluate the network for one agent (o,) or many (B, o); see `Policy.predict`."""
+        """Evaluate the network for one agent (o,) or many (B, o); see `Policy.predict`.
+
+        With receding goals the state is a `Waiting`, which the rule against deadlocks looks at.
+        """
         rows = as_numbers(observation, np.float32)
-        action = self.thrust(rows) * (1.0 / self.settings.thrust_scale)
+        sensed = Sensed.of(self.layout, rows)
+        if self.receding is not None:
+            sensed, state = self._led(sensed, self.receding, state, episode_start)
+        action = self._push(sensed) * (1.0 / self.settings.thrust_scale)
         return (action if rows.ndim == 2 else action[0]).astype(np.float32), state
 
+    def counters(self, state: PolicyState) -> dict[str, int]:
+        """Return how many detours there were, and how many control steps agents spent on them."""
+        if self.receding is None:
+            return {}
+        counted = (int(part.sum()) for part in (state.detours, state.steps))
+        return dict(zip(COUNTERS, counted, strict=True))
+
     def thrust(self, observation: Float32Array) -> FloatArray:
-        """Return u >= 0 of each agent, shape (B, 8) [N], for observations (B, o) or (o,)."""
-        sensed = Sensed.of(self.layout, observation)
+        """Return u >= 0 of each agent, shape (B, 8) [N], for observations (B, o) or (o,).
+
+        It remembers nothing: there are no detours.
+        """
+        return self._push(Sensed.of(self.layout, observation))
+
+    def _led(
+        self,
+        sensed: Sensed,
+        receding: Receding,
+        state: PolicyState,
+        episode_start: BoolArray | None,
+    ) -> tuple[Sensed, Waiting]:
+        """Turn the goals of those who are on a detour; see `Receding.turned`."""
+        count = len(sensed.own)
+        memory = Waiting.begun(count) if state is None else state
+        if not isinstance(memory, Waiting) or len(memory.waited) != count:
+            raise ValueError(
+                f"state must be what predict returned last for these {count} rows, or None at the "
+                "start of an episode"
+            )
+        if episode_start is not None:
+            memory = memory.restarted(np.ravel(episode_start).astype(bool))
+        goal = np.ascontiguousarray(sensed.goal).view(np.complex128)[:, 0]
+        settings = self.settings
+        goal, memory = receding.turned(goal, memory, settings.goal_radius, settings.control_period)
+        own = np.concatenate([goal.view(np.float64).reshape(-1, 2), sensed.own[:, 2:]], axis=1)
+        return sensed._replace(own=own), memory
+
+    def _push(self, sensed: Sensed) -> FloatArray:
+        """Return u >= 0 of each agent, shape (B, 8) [N]."""
         features = self.features(sensed)
         wrench = self.network(features).astype(np.float64)
         body = self.settings.system
@@ -136,7 +217,7 @@ class SpacecraftNetworkPolicy(SpacecraftActor):
     def features(self, sensed: Sensed) -> SetFeatures:
         """Return the inputs of the network."""
         radii = self.preset.agent_radius, self.preset.core
-        return spacecraft_features(sensed, self.settings, *radii)
+        return spacecraft_features(sensed, self.settings, *radii, receding=self.receding)
 
     def bare_forward(self, features: SetFeatures) -> Float32Array:
         """Evaluate the network alone, for timing."""

@@ -1,0 +1,142 @@
+"""Receding goals: what an agent is shown of a goal far away, and its way out of a deadlock.
+
+A network that has learned ways of a few metres within half a minute can fly any way: it is shown
+the point `reach` ahead on the straight line to the goal, always with the same time for it. That is
+a function of what is sensed, so that NumPy, C and ONNX compute it alike.
+
+Agents that wait for each other wait for ever: all see the same at every step. The rule against it
+needs no word between them and three numbers of each:
+
+    Who has not come `progress` closer to its goal than ever before for `patience`, and has not
+    arrived, is shown the point ahead turned about itself by `angle` for `detour`, counter-clockwise
+    the first time, clockwise the next, and so on by turns. Then it counts anew from where it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lagros_envs.arrays import BoolArray, ComplexArray, FloatArray
+from lagros_envs.checks import check_at_most, check_fields
+from lagros_envs.conventions import built_like
+from lagros_envs.numbers.functions import maximum, minimum
+from lagros_envs.tasks.spacecraft.scenarios import Preset
+
+# The largest worlds in which the networks learned ways to their goals: in them goals are shown as
+# they are.
+LEARNED_AGENTS, LEARNED_ARENA = 8, 6.0  # [m]
+COUNTERS = ("detours", "detour_steps")
+
+
+class Waiting(NamedTuple):
+    """What B agents remember, three numbers each, and what is counted of them.
+
+    Attributes:
+        closest: Least distance to the goal since the count began, shape (B,) [m].
+        waited: Control steps since the agent came closer; below zero while a detour lasts, (B,).
+        detours: Detours so far in this episode, (B,); their number says to which side the next is.
+        steps: Control steps of detours in this episode, which decide nothing, (B,).
+    """
+
+    closest: FloatArray
+    waited: FloatArray
+    detours: FloatArray
+    steps: FloatArray
+
+    @classmethod
+    def begun(cls, count: int) -> Waiting:
+        """Return the memories of agents at the start of their episodes."""
+        return cls(np.full(count, np.inf), *np.zeros((3, count)))
+
+    def restarted(self, starts: BoolArray) -> Waiting:
+        """Return the memories with those begun anew whose episodes start, shape (B,)."""
+        fresh = self.begun(len(starts))
+        return Waiting(*(np.where(starts, new, old) for new, old in zip(fresh, self, strict=True)))
+
+
+@dataclass(frozen=True)
+class Receding:
+    """How far goals are shown, and the rule against deadlocks.
+
+    Attributes:
+        reach: Farther goals are shown this far ahead [m].
+        pace: Distance of what is shown over the time that is shown for it [m/s].
+        progress: How much closer counts as progress [m].
+        patience: Time without progress before a detour [s].
+        angle: By which the point ahead is turned about the agent [rad].
+        detour: Time for which it is [s].
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    reach: float = 2.0
+    pace: float = 0.3
+    progress: float = 0.1
+    patience: float = 3.0
+    angle: float = 1.5
+    detour: float = 5.0
+
+    def __post_init__(self) -> None:
+        check_fields(self, positive=[item.name for item in fields(self)])
+        check_at_most("angle", self.angle, float(np.pi))
+
+    @classmethod
+    def chosen(cls, given: Any, preset: Preset) -> Receding | None:
+        """Return what an argument `receding` of a policy means.
+
+        Args:
+            given: True or False; a `Receding`, or a mapping of its fields that differ; None for
+                receding goals where worlds are larger than those in which the networks learned.
+            preset: Of the worlds, with their number of agents.
+
+        Raises:
+            ValueError: It is something else, a field is unknown, or a value is out of range.
+        """
+        if given is None:
+            given = preset.agents > LEARNED_AGENTS or preset.arena > LEARNED_ARENA
+        if isinstance(given, bool):
+            return cls() if given else None
+        return built_like(cls(), given, "receding")
+
+    def shown(self, goal: Any) -> tuple[Any, Any]:
+        """Return the point that is shown, and the time that is left for it [s].
+
+        Args:
+            goal: Relative to the agent, a vector of any kind of number [m].
+        """
+        distance = abs(goal)
+        share = minimum(self.reach / maximum(distance, self.reach), 1.0)
+        return goal * share, minimum(distance, self.reach) * (1.0 / self.pace)
+
+    def turned(
+        self, goal: ComplexArray, memory: Waiting, arrived: float, period: float
+    ) -> tuple[ComplexArray, Waiting]:
+        """Apply the rule against deadlocks for one control step.
+
+        Args:
+            goal: Relative to the agents, shape (B,) [m].
+            memory: Of the agents.
+            arrived: Distance at which an agent has arrived [m].
+            period: Since the last step [s].
+
+        Returns:
+            The goals, turned about those who are on a detour, and the memories.
+        """
+        distance, away = np.abs(goal), memory.waited < 0.0
+        patience, detour = (max(1, round(time / period)) for time in (self.patience, self.detour))
+        closer = distance <= memory.closest - self.progress
+        idle = (distance > arrived) & (away | ~closer)
+        waited = np.where(idle, memory.waited + 1.0, 0.0)
+        begins = waited >= patience
+        waited = np.where(begins, -detour, waited)
+        # Until a detour has ended the count begins anew at every step.
+        closest = np.where(closer | away, distance, memory.closest)
+        detours, away = memory.detours + begins, waited < 0.0
+        closest = np.where(away, distance, closest)
+        memory = Waiting(closest, waited, detours, memory.steps + away)
+        side = np.where(detours % 2 == 1, 1.0, -1.0)
+        return goal * np.exp(1j * self.angle * (away * side)), memory
