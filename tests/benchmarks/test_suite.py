@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from lagros_benchmarks.commands import cli
-from lagros_benchmarks.report.suite_page import MEASURES, System, page_text, suite_figure
+from lagros_benchmarks.report.suite_figure import suite_figure
+from lagros_benchmarks.report.suite_page import page_text, printed_tables
+from lagros_benchmarks.report.suite_rows import MEASURES, System
 from lagros_benchmarks.run.single import SingleExperiment
 from lagros_benchmarks.run.suite import SuiteSettings, flyable
+from lagros_benchmarks.run.suite_worst import searched, worst_of
+from lagros_benchmarks.worst_case.attack import AttackSettings
 from lagros_envs.registry import find_task
 
 TOYS = Path(__file__).parent / "toys.py"
 POLICIES = "tube-mpc,lqr,sd-lqr,ppo"
 SUITE = ["--policies", POLICIES, "--episodes", "3", "--fewer", "lqr=2", "--proved", "1"]
-SUITE += ["--seed", "4", "--initial-error", "0.05"]
+SUITE += ["--seed", "4", "--initial-error", "0.05", "--worst", "2", "--worst-flights", "20"]
 
 
 def invoke(*words: str):
@@ -102,6 +108,53 @@ def test_the_page_has_a_line_for_every_policy(flown):
     assert "not all of them flew lone" in text
 
 
+def test_what_is_found_worst_is_what_lagros_attack_finds(flown, slide, tmp_path):
+    out, result = flown
+    assert [(row["policy"], row["goal"]) for row in result["worst"]] == [
+        (policy, goal) for policy in ("tube-mpc", "lqr", "sd-lqr") for goal in ("success", "error")
+    ]
+    path = tmp_path / "attack.json"
+    words = ["--episodes", "2", "--budget", "20", "--seed", "4", "--json", str(path)]
+    for row in result["worst"]:
+        assert row["refused"] is None
+        if row["policy"] == "tube-mpc":
+            invoke("attack", slide, "--policy", "tube-mpc", "--goal", row["goal"], *words)
+            found = json.loads(path.read_text())
+            assert row["success_rate"] == 1.0 - found["broken_rate"]
+            assert row["error_per_bound"] == found["max_tracking_error_per_bound"]
+            assert row["scores"] == [one["score"] for one in found["outcomes"]]
+    text = (out / "all.md").read_text()
+    assert "Success [%] of 2 episodes under the worst disturbance" in text
+
+
+def test_a_policy_with_a_memory_is_not_searched_and_it_is_said(slide):
+    row = searched(AttackSettings.for_task(slide, "hybrid", 20, policy="mpc", episodes=1))
+    assert "keeps a memory" in row["refused"]
+    assert worst_of([row], row["task"], "mpc", "success") is None
+
+
+@pytest.mark.parametrize("count", [1, 7, 11])
+def test_what_is_printed_fits_a_terminal_and_leaves_no_system_out(count):
+    rows, searches = [], []
+    names = [f"system-x{chr(97 + index)}" for index in range(count)]
+    for name in names:
+        for policy in ("tube-mpc", "lqr-plan"):
+            rows += [made_up(policy, *key, {}) | {"task": name} for key in _keys()]
+            for goal in ("success", "error"):
+                figures = {"success_rate": 0.4, "error_per_bound": 12.34, "refused": None}
+                searches.append({"task": name, "policy": policy, "goal": goal, **figures})
+    settings = {"disturbances": ["uniform", "constant"]}
+    printed = list(printed_tables({"rows": rows, "worst": searches, "settings": settings}))
+    assert len({title for title, _ in printed}) == 2
+    console = Console(width=300, file=io.StringIO())
+    for _, table in printed:
+        console.print(table)
+    text = console.file.getvalue()
+    assert max(map(len, map(str.rstrip, text.splitlines()))) <= 80
+    assert all(text.count(name.partition("-")[2]) == 2 for name in names)
+    assert text.count("100/100") == text.count("40 12.3") == 2 * count
+
+
 def test_it_goes_on_where_it_was_and_is_drawn_again_without_flying(flown, slide, monkeypatch):
     out, result = flown
 
@@ -114,7 +167,7 @@ def test_it_goes_on_where_it_was_and_is_drawn_again_without_flying(flown, slide,
     assert again["rows"] == result["rows"]
     (out / "all.md").unlink()
     invoke("suite", "--from", str(out / "suite.json"), "--out", str(out))
-    assert (out / "all.md").read_text().startswith("# All systems, all policies\n\n    ")
+    assert (out / "all.md").read_text().startswith("# All systems, all policies\n\nIs the ")
     assert json.loads((out / "suite.json").read_text())["rows"] == result["rows"]
     # A task that is named takes the place of its rows, and the settings are those of the file.
     invoke("suite", slide, "--from", str(out / "suite.json"), "--out", str(out))
@@ -186,12 +239,14 @@ def test_ahead_is_a_whole_interval_below_one_under_every_kind_and_of_every_rival
     result = {
         "rows": [*rows, *best],
         "missing": [],
+        "worst": [],
         "command": "lagros suite",
         "settings": settings | {"initial_error": 0.2},
         "machine": {"processor": "a processor", "platform": ""},
     }
     text = page_text(result, Path("all.md"), None)
-    assert "- area: on 1 of 1 (toy)" in text
+    assert "- of c3m, sd-lqr, lqr together: on 1 of 1 (toy)" in text
+    assert "- of sd-lqr alone: on 1 of 1 (toy)" in text
     assert "**0.500 (0.450–0.550)**" in text
     assert "0.950 (0.855–1.04)" in text
 

@@ -30,7 +30,7 @@ FOLDER = Path("runs/suite")
 # What the rows of a file were made with, and cannot be changed for some of them.
 _OF_ALL = (
     *("--policies", "--episodes", "--fewer", "--worlds", "--disturbance", "--initial-error"),
-    *("--proved", "--seed"),
+    *("--proved", "--worst", "--worst-flights", "--seed"),
 )
 
 
@@ -62,6 +62,16 @@ def suite(
     proved: Annotated[
         int, typer.Option(help="Plans of which is proved what they come to; 0 for none.")
     ] = 50,
+    worst: Annotated[
+        int,
+        typer.Option(
+            help="Episodes for which the worst disturbance is searched, as `lagros attack` does; 0 "
+            "for none."
+        ),
+    ] = 5,
+    worst_flights: Annotated[
+        int, typer.Option(help="Flights that a search may spend on each of them.")
+    ] = 300,
     seed: Annotated[int, typer.Option(help="Seed; its episodes never occur in training.")] = 0,
     jobs: Annotated[int, typer.Option(help="Worker processes.")] = 1,
     begun: Annotated[
@@ -121,6 +131,8 @@ def suite(
                 disturbances=listed(disturbance, str, "--disturbance"),
                 initial_error=initial_error,
                 proved=proved,
+                worst=worst,
+                worst_flights=worst_flights,
                 seed=seed,
                 jobs=jobs,
                 **given,
@@ -163,7 +175,9 @@ def _fly(
     from lagros_policies.backends import BackendError
 
     if not settings.tasks:
-        _write(result, places).tell()
+        delivery = _write(result, places)
+        _print(result)
+        delivery.tell()
         return
     delivery = Delivery()
     for name in settings.tasks:
@@ -176,11 +190,25 @@ def _fly(
             interrupted(f"; the same command goes on with what is in {folder}")
         result = with_task(result, settings, flown)
         delivery = _write(result, places)
+    _print(result)
     delivery.tell()
 
 
+def _print(result: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    from lagros_benchmarks.report.suite_page import printed_tables
+
+    console = Console(highlight=False, markup=False)
+    for title, table in printed_tables(result):
+        console.print(title)
+        console.print(table)
+        console.print()
+
+
 def _write(result: dict[str, Any], places: tuple[Path, Path, Path]) -> Delivery:
-    from lagros_benchmarks.report.suite_page import page_text, suite_figure
+    from lagros_benchmarks.report.suite_figure import suite_figure
+    from lagros_benchmarks.report.suite_page import page_text
     from lagros_benchmarks.run.files import json_text
 
     rows, page, drawing = places

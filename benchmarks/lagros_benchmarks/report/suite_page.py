@@ -1,4 +1,4 @@
-"""The page "all systems x all policies" and its figure, from the rows of the suite alone."""
+"""The page "all systems x all policies", and what is printed of it, from the suite's rows alone."""
 
 from __future__ import annotations
 
@@ -6,18 +6,8 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from lagros_benchmarks.report.canvas import (
-    Drawn,
-    canvas,
-    check_figure_path,
-    legend,
-    save,
-    styles,
-)
 from lagros_benchmarks.report.formats import (
     by_condition,
     condition_title,
@@ -29,91 +19,29 @@ from lagros_benchmarks.report.formats import (
     policy_label,
     raised_lines,
     row_label,
+    short_label,
     with_interval,
 )
-from lagros_benchmarks.report.tables import texts
+from lagros_benchmarks.report.suite_rows import (
+    MEASURES,
+    OURS,
+    RIVALS,
+    Measure,
+    System,
+    policies_of,
+    systems_of,
+)
+from lagros_benchmarks.report.tables import plain_table, texts
 from lagros_benchmarks.run.experiment import Row
+from lagros_benchmarks.run.suite_worst import ERROR, SUCCESS
 from lagros_envs.registry import find_task, task_names
 from lagros_policies.room import shipped_file
 
-# Which of ours are held against which others.
-OURS = ("tube-mpc", "lagros")
-RIVALS = ("c3m", "sd-lqr", "lqr")
+if TYPE_CHECKING:
+    from rich.table import Table
+
 _NONE = "–"
-
-
-class Measure(NamedTuple):
-    """What policies are compared by, of which less is better.
-
-    Attributes:
-        name: In the page.
-        ratio: Field of `versus`.
-        beside: Whether it is of the episodes that begin beside their plan.
-    """
-
-    name: str
-    ratio: str
-    beside: bool
-
-
-MEASURES = (
-    Measure("area", "error_area_ratio", False),
-    Measure("normalised area", "error_area_ratio", True),
-    Measure("peak", "overshoot_ratio", True),
-)
-
-
-class System:
-    """The rows of one task of one body, found by policy, kind and start.
-
-    Attributes:
-        task: Its name.
-        policies: In the order of the suite.
-        kinds: Of disturbance.
-    """
-
-    def __init__(self, rows: Sequence[Row]) -> None:
-        self.task = str(rows[0]["task"])
-        self.kinds = list(dict.fromkeys(row["disturbance"] for row in rows))
-        self._rows = {
-            (row["policy"], row["disturbance"], bool(row["initial_error"]), row["guarantee"]): row
-            for row in rows
-        }
-        self.policies = list(dict.fromkeys(row["policy"] for row in rows))
-
-    @property
-    def first(self) -> Row:
-        """Any of its rows."""
-        return next(iter(self._rows.values()))
-
-    def row(self, policy: str, kind: str, beside: bool = False) -> Row | None:
-        """Return the row of a policy under a kind, of episodes on or beside their plan."""
-        return self._rows.get((policy, kind, beside, False))
-
-    def proved(self, policy: str) -> Row | None:
-        """Return the row of a policy in which guarantees were proved."""
-        return self._rows.get((policy, self.kinds[0], False, True))
-
-    def ratio(self, measure: Measure, ours: str, rival: str, kind: str) -> Any:
-        """Return ratio and interval of a measure on the same episodes; None where there is none."""
-        row = self.row(ours, kind, measure.beside)
-        versus = None if row is None else row["versus"].get(rival)
-        if versus is None or versus[measure.ratio] is None:
-            return None
-        return versus[measure.ratio], versus[f"{measure.ratio}_ci95"]
-
-    def ahead(self, measure: Measure, ours: str, rival: str) -> bool | None:
-        """Return whether the whole interval is below 1 under every kind; None without a rival."""
-        found = [self.ratio(measure, ours, rival, kind) for kind in self.kinds]
-        if any(one is None for one in found):
-            return None
-        return all(one[1] is not None and one[1][1] < 1.0 for one in found)
-
-
-def systems_of(rows: Sequence[Row]) -> list[System]:
-    """Return the systems of one body among rows."""
-    names = dict.fromkeys(row["task"] for row in rows if "agents" not in row)
-    return [System([row for row in rows if row["task"] == name]) for name in names]
+_TERMINAL = 80
 
 
 def page_text(result: dict[str, Any], page: Path, figure: Path | None) -> str:
@@ -125,13 +53,15 @@ def page_text(result: dict[str, Any], page: Path, figure: Path | None) -> str:
         figure: Where the figure lies; None without one.
     """
     rows, settings = result["rows"], result["settings"]
-    systems = systems_of(rows)
+    systems = systems_of(rows, result["worst"])
     fewer = ", ".join(f"{name} {count}" for name, count in settings["fewer"].items())
     some = f" ({fewer})" if fewer else ""
     kinds = " / ".join(settings["disturbances"])
     measured = _link("What is measured, with formulas: ", page, "../comparing.md")
-    blocks = [
-        "# All systems, all policies",
+    blocks = ["# All systems, all policies"]
+    if systems:
+        blocks.append(_ahead_words(systems))
+    blocks += [
         f"    {result['command']}",
         f"{settings['episodes']} paired episodes{some} of each system, policy and kind of "
         "disturbance, each system at its own bound d̄; intervals are 95 %. Starts, goals, discs, "
@@ -142,8 +72,10 @@ def page_text(result: dict[str, Any], page: Path, figure: Path | None) -> str:
         place = os.path.relpath(figure, page.parent)
         blocks.append(f"![Success against the area under the error, by system]({place})")
     if systems:
-        blocks += ["## Success [%]", _glance(systems), "## Ahead, and behind"]
-        blocks += [_words(systems), _ahead_table(systems)]
+        blocks += ["## Success [%]", _by_system(systems, _successes)]
+        blocks += _worst_blocks(systems)
+        blocks += _proved_blocks(systems)
+        blocks += _ahead_blocks(systems)
     for system in systems:
         blocks += _system_blocks(system, result, page)
     for name in dict.fromkeys(row["task"] for row in rows if "agents" in row):
@@ -154,6 +86,45 @@ def page_text(result: dict[str, Any], page: Path, figure: Path | None) -> str:
         "Δt is that of one call of the policy, the median."
     )
     return "\n\n".join(block for block in blocks if block) + "\n"
+
+
+def printed_tables(result: dict[str, Any]) -> Iterator[tuple[str, Table]]:
+    """Yield title and rich table of success, and of what was found worst, 80 columns at most."""
+    systems = systems_of(result["rows"], result["worst"])
+    kinds = "/".join(result["settings"]["disturbances"])
+    shown: list[tuple[str, Callable[[System, str], str]]] = [
+        (f"success [%], {kinds}", lambda one, name: _successes(one, name).replace(" / ", "/")),
+        ("worst found: success [%], ‖x − x_d‖/d̄ [s]", _worst_cell),
+    ]
+    for title, cell in shown:
+        for group in _that_fit(systems, cell):
+            lines = [
+                [short_label(name), *(cell(system, name) for system in group)]
+                for name in policies_of(group)
+            ]
+            if any(text != _NONE for line in lines for text in line[1:]):
+                headings = ["policy", *(system.task.replace("-", "-\n") for system in group)]
+                yield title, plain_table(headings, lines)
+
+
+def _that_fit(
+    systems: Sequence[System], cell: Callable[[System, str], str]
+) -> Iterator[list[System]]:
+    """Yield systems in groups whose columns fit into a terminal beside those of the names."""
+    policies = policies_of(systems)
+    first = max((len(short_label(name)) for name in policies), default=0)
+    group: list[System] = []
+    width = first
+    for system in systems:
+        heading = max(len(part) + 1 for part in system.task.split("-"))
+        own = 2 + max([heading, *(len(cell(system, name)) for name in policies)])
+        if group and width + own > _TERMINAL:
+            yield group
+            group, width = [], first
+        group.append(system)
+        width += own
+    if group:
+        yield group
 
 
 def _link(text: str, page: Path, place: str) -> str:
@@ -170,47 +141,135 @@ def _pair(values: Sequence[str]) -> str:
     return _NONE if all(value == _NONE for value in values) else " / ".join(values)
 
 
-def _glance(systems: Sequence[System]) -> str:
-    policies = list(dict.fromkeys(name for system in systems for name in system.policies))
-    lines = []
-    for system in systems:
-        line = [system.task, number(system.first["bound"])]
-        for policy in policies:
-            found = [system.row(policy, kind) for kind in system.kinds]
-            line.append(
-                _pair([_NONE if one is None else percent(one["success_rate"]) for one in found])
-            )
-        lines.append(line)
-    return markdown_table(["system", "d̄", *map(policy_label, policies)], lines) if lines else ""
-
-
-def _words(systems: Sequence[System]) -> str:
-    """Say on how many systems one of ours is ahead of all rivals, and on which not."""
-    names = ", ".join(RIVALS)
-    parts = [
-        "Median over paired episodes of what (b) or (c) has over what another policy has, with its "
-        "interval: *ahead* is a whole interval below 1, under every kind of disturbance. An error "
-        "before the goal is held against the plan that all share, whether a policy follows it or "
-        "not: `lqr` does not. One of (b) and (c) is ahead of all of "
-        f"{names}:"
+def _by_system(systems: Sequence[System], cell: Callable[[System, str], str]) -> str:
+    """Return the table of a cell for every system and policy."""
+    policies = policies_of(systems)
+    lines = [
+        [system.task, number(system.first["bound"]), *(cell(system, name) for name in policies)]
+        for system in systems
     ]
-    for measure in MEASURES:
-        ahead, behind, unknown = [], [], []
-        for system in systems:
-            verdicts = [[system.ahead(measure, our, one) for one in RIVALS] for our in OURS]
-            if any(all(verdict is True for verdict in one) for one in verdicts):
-                ahead.append(system.task)
-            elif any(None in one for one in verdicts):
-                unknown.append(system.task)
-            else:
-                behind.append(system.task)
-        line = f"- {measure.name}: on {len(ahead)} of {len(systems)}"
-        line += f" ({', '.join(ahead)})" if ahead else ""
-        line += f"; not on {', '.join(behind)}" if behind else ""
-        line += f"; not all of them flew {', '.join(unknown)}" if unknown else ""
-        parts.append(line)
-    blocks = (parts[0], "\n".join(parts[1:]), _learned(systems))
-    return "\n\n".join(block for block in blocks if block)
+    return markdown_table(["system", "d̄", *map(policy_label, policies)], lines)
+
+
+def _successes(system: System, policy: str) -> str:
+    found = [system.row(policy, kind) for kind in system.kinds]
+    return _pair([_NONE if row is None else _whole(row["success_rate"]) for row in found])
+
+
+def _whole(rate: float) -> str:
+    """Return a rate in percent, without a decimal where there is none."""
+    return percent(rate).removesuffix(".0")
+
+
+def _worst_cell(system: System, policy: str) -> str:
+    success, error = (system.worst(policy, goal) for goal in (SUCCESS, ERROR))
+    if success is None:
+        return _NONE
+    error_text = number(None if error is None else error["error_per_bound"])
+    return f"{100.0 * success['success_rate']:.0f} {error_text}"
+
+
+def _worst_blocks(systems: Sequence[System]) -> Iterator[str]:
+    searches = [
+        row
+        for system in systems
+        for policy in system.policies
+        if (row := system.worst(policy, SUCCESS)) is not None
+    ]
+    if not searches:
+        return
+    episodes = " or ".join(
+        str(count) for count in dict.fromkeys(row["episodes"] for row in searches)
+    )
+    flights = max(row["flights_per_episode"] for row in searches)
+    yield "## Worst found"
+    yield (
+        f"Success [%] of {episodes} episodes under the worst disturbance within d̄ that a search of "
+        f"at most {flights} flights an episode found (`lagros attack --goal success`), then the "
+        "largest ‖x − x_d‖/d̄ [s] that another found (`--goal error`; of policies that do not "
+        "follow x_d it says little). A longer search may find worse: these are *observed*. A dash: "
+        "the policy keeps a memory, which the search cannot fly."
+    )
+    yield _by_system(systems, _worst_cell)
+
+
+def _proved_blocks(systems: Sequence[System]) -> Iterator[str]:
+    rows = []
+    for system in systems:
+        found = [system.proved(name) for name in OURS]
+        plans = [row["episodes"] for row in found if row is not None]
+        if plans:
+            shares = [_NONE if row is None else percent(row["guaranteed_rate"]) for row in found]
+            rows.append([system.task, str(plans[0]), *shares])
+    if not rows:
+        return
+    yield "## Proved [%]"
+    yield (
+        "Share of plans of which it is *proved*, over every disturbance within d̄, that the flight "
+        "succeeds and breaks no rule of its task. A dash: it was not tried."
+    )
+    yield markdown_table(["system", "plans", *map(policy_label, OURS)], rows)
+
+
+def _ahead(systems: Sequence[System], measure: Measure, rivals: Sequence[str]) -> str:
+    """Say on which systems one of ours is ahead of all of some rivals."""
+    ahead, behind, unknown = [], [], []
+    for system in systems:
+        verdicts = [[system.ahead(measure, our, one) for one in rivals] for our in OURS]
+        if any(all(verdict is True for verdict in one) for one in verdicts):
+            ahead.append(system.task)
+        elif any(None in one for one in verdicts):
+            unknown.append(system.task)
+        else:
+            behind.append(system.task)
+    line = f"on {len(ahead)} of {len(systems)}"
+    line += f" ({', '.join(ahead)})" if ahead else ""
+    line += f"; not on {', '.join(behind)}" if behind else ""
+    return line + (f"; not all of them flew {', '.join(unknown)}" if unknown else "")
+
+
+def _ahead_words(systems: Sequence[System]) -> str:
+    """Say at once on how many systems one of ours is ahead, and on which not."""
+    area = MEASURES[0]
+    lines = [
+        "Is the contraction law (b), or its network (c), ahead in the area under the error? "
+        "*Ahead* is: the whole interval of the paired median ratio below 1, under every kind of "
+        "disturbance.",
+        "",
+        f"- of {', '.join(RIVALS)} together: {_ahead(systems, area, RIVALS)}",
+        *(f"- of {rival} alone: {_ahead(systems, area, (rival,))}" for rival in RIVALS),
+    ]
+    return "\n".join(lines)
+
+
+def _ahead_blocks(systems: Sequence[System]) -> Iterator[str]:
+    yield "## Ahead, and behind"
+    yield (
+        "Median over paired episodes of the area that (b) or (c) has over that of another policy, "
+        "with its interval, bold where that is below 1. An error before the goal is held against "
+        "the plan that all share, whether a policy follows it or not: `lqr` does not. Of all three "
+        "together ahead, in the two other measures, of episodes that begin beside their plan:"
+    )
+    yield "\n".join(f"- {one.name}: {_ahead(systems, one, RIVALS)}" for one in MEASURES[1:])
+    yield _learned(systems)
+    kinds = systems[0].kinds
+    headings = ["system", "policy"]
+    headings += [f"area / {rival}, {kind}" for rival in RIVALS for kind in kinds]
+    lines = [
+        [
+            system.task,
+            policy_label(ours),
+            *(
+                _ratio(system.ratio(MEASURES[0], ours, rival, kind))
+                for rival in RIVALS
+                for kind in kinds
+            ),
+        ]
+        for system in systems
+        for ours in OURS
+        if ours in system.policies
+    ]
+    yield markdown_table(headings, lines) if lines else ""
 
 
 def _learned(systems: Sequence[System]) -> str:
@@ -227,26 +286,9 @@ def _learned(systems: Sequence[System]) -> str:
         return ""
     return (
         f"What {RIVALS[0]} promises, contraction over a hold at its rate, was observed at this "
-        f"share of fresh states: {', '.join(shares)}. Where that is near zero it flies without "
-        "what its method is about, and to be ahead of it says little. One recipe trained it for "
-        "all systems."
+        f"share of fresh states: {', '.join(shares)}. Where that is low it flies without what its "
+        "method is about. The same scan chose its settings for every system."
     )
-
-
-def _ahead_table(systems: Sequence[System]) -> str:
-    headings = ["system", "policy", "disturbance"]
-    headings += [f"{measure.name} / {rival}" for rival in RIVALS for measure in MEASURES]
-    lines = []
-    for system in systems:
-        for ours in (name for name in OURS if name in system.policies):
-            for kind in system.kinds:
-                line = [system.task, policy_label(ours), kind]
-                for rival in RIVALS:
-                    line += [
-                        _ratio(system.ratio(measure, ours, rival, kind)) for measure in MEASURES
-                    ]
-                lines.append(line)
-    return markdown_table(headings, lines) if lines else ""
 
 
 def _ratio(found: Any) -> str:
@@ -272,9 +314,8 @@ def _system_blocks(system: System, result: dict[str, Any], page: Path) -> Iterat
     headings = [
         "policy",
         *(f"success, {kind} [%]" for kind in system.kinds),
-        "strict [%]",
-        *(f"area, {kind}" for kind in system.kinds),
-        *("normalised area [s]", "peak", "C", "rate [1/s]", "effort", "Δt [ms]", "proved [%]"),
+        *("strict [%]", "area", "normalised area [s]", "peak", "C", "rate [1/s]", "effort"),
+        "Δt [ms]",
     ]
     lines = [_line(system, policy) for policy in system.policies]
     missing = [one for one in result["missing"] if one[0] == system.task]
@@ -300,7 +341,6 @@ def _system_blocks(system: System, result: dict[str, Any], page: Path) -> Iterat
 def _line(system: System, policy: str) -> list[str]:
     plain = [system.row(policy, kind) for kind in system.kinds]
     beside = [system.row(policy, kind, True) for kind in system.kinds]
-    proved = system.proved(policy)
     known = [row for row in (*plain, *beside) if row is not None]
 
     def both(group: Sequence[Row | None], show: Callable[[Row], str]) -> str:
@@ -312,23 +352,15 @@ def _line(system: System, policy: str) -> list[str]:
             _NONE if row is None else with_interval(row["success_rate"], row["success_ci95"])
             for row in plain
         ),
-        both(plain, lambda row: percent(row["strict_success_rate"])),
-        *(_NONE if row is None else _spread(row, "error_area") for row in plain),
+        both(plain, lambda row: _whole(row["strict_success_rate"])),
+        both(plain, lambda row: number(row["error_area_mean"])),
         both(beside, lambda row: number(row["normalised_area_mean"])),
         both(beside, lambda row: number(row["overshoot_mean"])),
         both(beside, lambda row: number(row["envelope_overshoot"])),
         both(beside, lambda row: number(row["convergence_rate_mean"])),
         both(plain, lambda row: number(row["effort_mean"])),
         both(plain[:1], lambda row: milliseconds(row["step_time_median_s"])),
-        _NONE if proved is None else percent(proved["guaranteed_rate"]),
     ]
-
-
-def _spread(row: Row, name: str) -> str:
-    mean, interval = row[f"{name}_mean"], row[f"{name}_ci95"]
-    if mean is None or interval is None:
-        return number(mean)
-    return f"{number(mean)} ({number(interval[0])}–{number(interval[1])})"
 
 
 def _worlds_blocks(rows: Sequence[Row], page: Path) -> Iterator[str]:
@@ -338,55 +370,3 @@ def _worlds_blocks(rows: Sequence[Row], page: Path) -> Iterator[str]:
         words = texts(group[0])
         yield f"{condition_title(group[0])}, {group[0]['episodes']} worlds:"
         yield markdown_rows(words.columns(group[0]), words.ordered(group))
-
-
-def suite_figure(rows: Sequence[Row], path: str | Path | None) -> Drawn:
-    """Draw strict success against the area under the error, system by system.
-
-    Under the last kind of disturbance; the area is in units of that of the least.
-
-    Raises:
-        ValueError: The rows are of no system of one body.
-    """
-    path = check_figure_path(path)
-    systems = systems_of(rows)
-    if not systems:
-        raise ValueError("the figure needs a system of one body")
-    columns = min(len(systems), 4)
-    lines = -(-len(systems) // columns)
-    figure, panels = canvas(2.6 * columns + 0.6, 2.5 * lines + 0.8, lines, columns)
-    policies = list(dict.fromkeys(name for system in systems for name in system.policies))
-    looks = styles(policies)
-    kind = systems[0].kinds[-1]
-    for system, axes in zip(systems, panels, strict=False):
-        found = {name: system.row(name, kind) for name in policies}
-        areas = {
-            name: row["error_area_mean"]
-            for name, row in found.items()
-            if row is not None and row["error_area_mean"]
-        }
-        least = min(areas.values(), default=1.0)
-        for name in policies:
-            row = found[name]
-            drawn = row is not None and name in areas
-            axes.plot(
-                [areas[name] / least] if drawn else [np.nan],
-                [100.0 * row["strict_success_rate"]] if drawn and row is not None else [np.nan],
-                color=looks[name].colour,
-                marker=looks[name].marker,
-                markersize=7,
-                alpha=0.85,
-                linestyle="none",
-                label=policy_label(name),
-            )
-        axes.set_xscale("log")
-        axes.set(ylim=(-5, 105), yticks=(0, 25, 50, 75, 100))
-        axes.set_title(f"{system.task}, d̄ = {system.first['bound']:g}", loc="left", fontsize=10)
-    for axes in panels[len(systems) :]:
-        axes.set_axis_off()
-    figure.supxlabel(
-        f"area under the error, in units of the least ({kind} disturbance)", fontsize=10
-    )
-    figure.supylabel("strict success [%]", fontsize=10)
-    legend(figure, panels[0])
-    return save(figure, path)

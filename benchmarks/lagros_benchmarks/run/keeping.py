@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import json
 import logging
+import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -48,6 +49,12 @@ class Kept:
         # A policy may change the working folder.
         self._place = folder.absolute()
         self._failed = False
+
+    @classmethod
+    def named(cls, folder: Path, task: str, key: str) -> Kept:
+        """Return those of a key in a folder of their own, named after their task."""
+        plain = re.sub(r"[^\w.-]", "-", task)
+        return cls(folder / f"{plain}-{key[:16]}", key)
 
     def __len__(self) -> int:
         return sum(1 for _ in self._place.glob("*.json"))

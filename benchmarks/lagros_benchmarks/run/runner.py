@@ -6,7 +6,6 @@ one process runs them or many. What depends on the task is an `Experiment`.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -57,8 +56,7 @@ def kept_in(
     """
     check_instance("settings", settings, BenchmarkSettings)
     key = fingerprint(settings, toolbox or Toolbox())
-    name = re.sub(r"[^\w.-]", "-", settings.description.name)
-    return Kept(Path(folder) / f"{name}-{key[:16]}", key)
+    return Kept.named(Path(folder), settings.description.name, key)
 
 
 def run_benchmark(

@@ -14,6 +14,7 @@ from lagros_benchmarks.run.experiment import Progress, Row
 from lagros_benchmarks.run.library import SetupError, built_policy, make_policy
 from lagros_benchmarks.run.runner import kept_in, run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings, check_policy
+from lagros_benchmarks.run.suite_worst import search_worst
 from lagros_benchmarks.run.surroundings import machine, own_command, threads, versions
 from lagros_envs.checks import check_fields, check_whole
 from lagros_envs.reading import read_json
@@ -37,7 +38,7 @@ _PAGE = (
 # Of the settings, what the rows depend on and the page says.
 _SAID = (
     *("policies", "episodes", "fewer", "worlds", "disturbances", "initial_error", "proved"),
-    *("seed", "jobs"),
+    *("worst", "worst_flights", "seed", "jobs"),
 )
 
 
@@ -57,11 +58,13 @@ class TaskResult(NamedTuple):
         rows: As in the JSON of `lagros bench`, without curves; of one body those with an initial
             error too.
         missing: Policies that did not fly.
+        worst: What the searches of the disturbance came to, see `suite_worst.search_worst`.
     """
 
     task: str
     rows: list[Row]
     missing: list[Missing]
+    worst: list[Row]
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,9 @@ class SuiteSettings:
         initial_error: That error, as a share of the scale of the state.
         proved: Plans of which the guarantees are proved, of the policies that the task certifies; 0
             for none.
+        worst: Episodes of one body for each of which the worst disturbance is searched, of every
+            policy; 0 for none.
+        worst_flights: Flights that a search may spend on an episode.
         seed: Of all runs.
         jobs: Worker processes.
         backend: Whose processes they are.
@@ -95,6 +101,8 @@ class SuiteSettings:
     disturbances: tuple[str, ...] = ("uniform", "constant")
     initial_error: float = 0.2
     proved: int = 50
+    worst: int = 5
+    worst_flights: int = 300
     seed: int = 0
     jobs: int = 1
     backend: Backend = LOKY
@@ -105,7 +113,9 @@ class SuiteSettings:
             check_whole(name, getattr(self, name), 1, 1_000_000)
         for policy, count in self.fewer.items():
             check_whole(f"fewer={policy}", count, 1, self.episodes)
-        check_whole("proved", self.proved, 0, 1_000_000)
+        for name in ("proved", "worst"):
+            check_whole(name, getattr(self, name), 0, 1_000_000)
+        check_whole("worst_flights", self.worst_flights, 1, 1_000_000)
         described = [find_task(name) for name in self.tasks]
         for task in described:
             self._run(task)  # says what is wrong with the rest
@@ -195,6 +205,7 @@ def fly_task(
     """
     task: Any = find_task(name)
     missing: list[Missing] = []
+    policies: tuple[str, ...] = ()
     if task.most_agents > 1:
         runs = [settings._run(task)]
     else:
@@ -213,7 +224,18 @@ def fly_task(
             missing += [Missing(task.name, policy, str(error)) for policy in run.policies]
             continue
         rows += [slim(row) for row in summarise(flown)]
-    return TaskResult(task.name, rows, missing)
+    searched: list[Row] = []
+    if settings.worst and runs and task.most_agents == 1:
+        if say is not None:
+            say(f"{task.name}: worst found, {settings.worst} × {', '.join(policies)}")
+        searched = search_worst(
+            settings._run(task, policies=policies, episodes=settings.worst, initial_error=0.0),
+            task,
+            settings.worst_flights,
+            folder,
+            progress,
+        )
+    return TaskResult(task.name, rows, missing, searched)
 
 
 def slim(row: Row) -> Row:
@@ -227,12 +249,15 @@ def with_task(result: dict[str, Any], settings: SuiteSettings, flown: TaskResult
     surroundings = {"machine": machine(), "versions": versions(), "threads": threads()}
     # A command that flies some tasks anew is not what makes all of it.
     begun = {"command": shlex.join(own_command()), "settings": said, **surroundings}
-    before = {"rows": [], "missing": [], **begun, **result}
-    others = [row for row in before["rows"] if row["task"] != flown.task]
+    before = {"rows": [], "missing": [], "worst": [], **begun, **result}
+    others, searched = (
+        [row for row in before[name] if row["task"] != flown.task] for name in ("rows", "worst")
+    )
     missing = [one for one in before["missing"] if one[0] != flown.task]
     names = list(dict.fromkeys((*(row["task"] for row in before["rows"]), flown.task)))
     rows = sorted([*others, *flown.rows], key=lambda row: names.index(row["task"]))
-    return {**before, "rows": rows, "missing": [*missing, *flown.missing]}
+    found = {"missing": [*missing, *flown.missing], "worst": [*searched, *flown.worst]}
+    return {**before, "rows": rows, **found}
 
 
 def read_result(path: Path) -> dict[str, Any]:
@@ -245,7 +270,7 @@ def read_result(path: Path) -> dict[str, Any]:
     found = read_json(path)
     try:
         said = {name: found["settings"][name] for name in _SAID}
-        for name in ("rows", "missing", "command", "machine"):
+        for name in ("rows", "missing", "worst", "command", "machine"):
             found[name]
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} is not the JSON of `lagros suite`: it has no {error}") from None
