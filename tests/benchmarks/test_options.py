@@ -228,6 +228,8 @@ SUITE = {
     "--disturbance": Row(KINDS),
     "--initial-error": Row(NUMBER, CARTPOLE),
     "--proved": Row(WHOLE, CARTPOLE),
+    "--worst": Row(WHOLE, CARTPOLE),
+    "--worst-flights": Row(POSITIVE_WHOLE, CARTPOLE),
     "--seed": Row(WHOLE),
     "--jobs": Row(POSITIVE_WHOLE),
     "--from": Row(READ),
