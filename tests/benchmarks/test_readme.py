@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -20,19 +21,15 @@ TEXT = README.read_text(encoding="utf-8")
 
 def test_every_block_runs(capsys: pytest.CaptureFixture[str]) -> None:
     blocks = documents.python_blocks(TEXT)
-    assert len(blocks) == 6
+    assert len(blocks) == 3
     names: dict[str, Any] = {}
     for block in blocks:
         exec(block, names)
-    single, many, *table = capsys.readouterr().out.splitlines()
-    assert single.startswith("True ")
-    assert len(many.split(",")) == 6
-
-    assert table[0].startswith("cartpole, uniform disturbance")
-    assert any(line.split()[:2] == ["mine", "100.0"] for line in table)
+    assert capsys.readouterr().out.startswith("True ")
 
     # The policy of one's own answers one observation, and a batch of them row by row.
-    env, envs, lean = names["env"], names["envs"], names["Lean"]
+    env, lean = names["env"], names["Lean"]
+    envs = gymnasium.make_vec("lagros/CartPole-v0", num_envs=8, disturbance="gust")
     policy = lean(env.unwrapped.settings)
     rows, _ = envs.reset(seed=2)
     actions, _ = policy.predict(rows)
@@ -66,20 +63,19 @@ def test_the_readers_own_system_flies(monkeypatch: pytest.MonkeyPatch, tmp_path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "said"), [(1, "6 of 6 arrived, 0 collided"), (3, "2 collided")])
-def test_the_worlds_to_watch_are_what_is_said_of_them(
-    seed: int, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_nobody_collides_in_the_world_of_the_film(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    command = ["watch", "spacecraft", "--seed", str(seed), "--speed", "100", "--video", "x.gif"]
+    command = ["watch", "spacecraft", "--seed", "1", "--speed", "100", "--video", "x.gif"]
     result = CliRunner().invoke(cli.app, command)
     assert result.exit_code == 0
-    assert said in result.output
+    assert "6 of 6 arrived, 0 collided" in result.output
 
 
 def test_the_first_half_needs_no_other_extra_than_that_of_the_command_line() -> None:
     blocks, typed = first_half.blocks_and_commands(TEXT)
-    assert len(blocks) == 6
+    assert len(blocks) == 3
     assert {command.words[1] for command in typed} == {
         *("bench", "watch", "attack", "certify", "export")
     }
