@@ -88,6 +88,17 @@ class ArmSettings(Task):
             if self.goal_distance(start.tolist(), goal.tolist(), np) >= _WAY:
                 return Scenario(start, goal)
 
+    def sample_many(self, rng: np.random.Generator, count: int) -> Scenario:
+        """Draw as `sample` does, all at once."""
+        start, goal = np.zeros((count, 4)), np.zeros((count, 4))
+        upright = np.array([_UPRIGHT, 0.0])
+        start[:, :2] = upright + rng.uniform(-_BESIDE, _BESIDE, (count, 2))
+        near = np.arange(count)
+        while len(near):
+            goal[near, :2] = upright + rng.uniform(-1.0, 1.0, (len(near), 2)) * _REACH
+            near = near[self.goal_distance(start[near].T, goal[near].T, np) < _WAY]
+        return Scenario(start, goal, np.zeros((count, 0, 3)))
+
     def tip(self, state: Sequence[Any], functions: Any) -> tuple[Any, Any]:
         """Return where the tip is [m], the shoulder being at the origin."""
         first, second = self.system.first_length, self.system.second_length

@@ -1,0 +1,82 @@
+"""What a task costs before it flies: its metric once, and one plan of an episode.
+
+    OMP_NUM_THREADS=1 python benchmarks/speed/making.py [--plans 50] [--tasks car arm]
+        [--json benchmarks/results/speed_making.json]
+
+Processor time on one thread, so that other processes on the machine count little. Plans are of
+the first episodes that `lagros bench` flies, from their starts. One that does not hold counts
+with the time that it took; how many hold stands beside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.append(str(Path(__file__).parents[1]))
+
+from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_envs.files import write_atomic
+from lagros_envs.registry import find_task, task_names
+from lagros_envs.seeding import episode_streams
+from lagros_envs.task import Task
+from lagros_policies.learning.metric import metric_settings
+from lagros_policies.planning.planner import planner_of
+
+
+def measure(task: Task, plans: int) -> dict[str, object]:
+    """Return the times of a task [s]."""
+    begun = time.process_time()
+    metric = metric_settings(task).design(task)
+    designed = time.process_time() - begun
+    planner, times, held = planner_of(task), [], 0
+    for seed in BenchmarkSettings.for_task(task.name, episodes=plans).episode_seeds():
+        episode = task.sample(episode_streams(seed).scenario)
+        begun = time.process_time()
+        plan = planner.plan(episode.initial_state, episode.goal, discs=episode.discs)
+        times.append(time.process_time() - begun)
+        held += plan.solved
+    check = metric.verification
+    return {
+        "task": task.name,
+        "metric_cpu_seconds": designed,
+        "violations": None if check is None else check.violations,
+        "plans": plans,
+        "plans_that_hold": held,
+        "plan_cpu_seconds_median": float(np.median(times)),
+        "plan_cpu_seconds_p95": float(np.quantile(times, 0.95)),
+    }
+
+
+def main() -> None:
+    """Print the table and write the file that is asked for."""
+    parser = argparse.ArgumentParser(description="Metric and plans of every task, processor time.")
+    parser.add_argument("--plans", type=int, default=50)
+    parser.add_argument("--tasks", nargs="+", default=task_names())
+    parser.add_argument("--json", type=Path)
+    wanted = parser.parse_args()
+    rows = []
+    for name in wanted.tasks:
+        task = find_task(name)
+        if isinstance(task, Task):
+            row = measure(task, wanted.plans)
+            rows.append(row)
+            sys.stdout.write(
+                f"{name:<14} metric {row['metric_cpu_seconds']:6.1f} s   plan, median "
+                f"{row['plan_cpu_seconds_median']:.3f} s, p95 {row['plan_cpu_seconds_p95']:.3f} s, "
+                f"{row['plans_that_hold']} of {row['plans']} hold\n"
+            )
+            sys.stdout.flush()
+    if wanted.json:
+        command = "OMP_NUM_THREADS=1 python benchmarks/speed/making.py"
+        text = json.dumps({"command": command, "rows": rows}, indent=1)
+        write_atomic(wanted.json, text + "\n")
+
+
+if __name__ == "__main__":
+    main()
