@@ -10,7 +10,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 # The words that a line to type begins with.
-PROGRAMS = ("lagros", "python", "python3", "pip", "make", "source", "git")
+PROGRAMS = (
+    "lagros",
+    "python",
+    "python3",
+    "pip",
+    "make",
+    "source",
+    "git",
+    "cc",
+    "./a.out",
+    "pytest",
+)
 _ASSIGNMENT = re.compile(r"[A-Z][A-Z0-9_]*=\S*")
 
 
@@ -36,6 +47,13 @@ def environment() -> dict[str, str]:
         "PYTHONPATH": os.pathsep.join(modules),
         "SDL_VIDEODRIVER": "dummy",
     }
+
+
+def words(text: str) -> int:
+    """Return how many words of two letters or more a page has, without code and tables."""
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    lines = [line for line in prose.splitlines() if not line.startswith(("|", "    "))]
+    return len(re.findall(r"[^\W\d_]{2,}", "\n".join(lines)))
 
 
 def python_blocks(text: str) -> list[str]:

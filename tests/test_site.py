@@ -61,6 +61,22 @@ def test_a_page_becomes_cells_in_its_order() -> None:
     ]
 
 
+def test_the_guide_is_short() -> None:
+    """Without code and tables; what was tried belongs to benchmarks/studies."""
+    counts = {
+        path.relative_to(DOCS).as_posix(): documents.words(path.read_text(encoding="utf-8"))
+        for path in DOCS.rglob("*.md")
+    }
+    assert sum(counts.values()) <= 15_000, sorted(counts.items(), key=lambda item: -item[1])[:8]
+    assert counts["guarantees.md"] <= 1_200
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 900
+
+
+def test_words_are_counted_without_code_and_tables() -> None:
+    text = "# Two words\n\n| not | these |\n\n    nor this\n\n```python\nx = 1\n```\nand x here\n"
+    assert documents.words(text) == 4
+
+
 def test_the_tables_of_results_say_what_the_rows_say() -> None:
     """Of the cart-pole's table, in the README and on the page of results."""
     rows = json.loads((ROOT / "benchmarks/results/cartpole_grid.json").read_text(encoding="utf-8"))
