@@ -14,7 +14,8 @@ from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.policy import BasePolicy, Policy
 from lagros_policies.safety.barrier import BarrierSettings, BrakingBarrier
-from lagros_policies.tasks.spacecraft.safety_filter import FilterState, SafetyFilter
+from lagros_policies.tasks.spacecraft.filtering import FilterState
+from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.thrusters import allocate
 from tests.policies.programs import least_violation_by_program, nearest_by_program

@@ -56,6 +56,13 @@ def attack(
     safety_filter: Annotated[
         bool, typer.Option("--safety-filter", help="Put the safety filter on the policy.")
     ] = False,
+    proved_filter: Annotated[
+        bool, typer.Option("--proved-filter", help="Put the filter with a proof on it.")
+    ] = False,
+    agents: Annotated[
+        int | None, typer.Option(help="Agents in a world; the task's own if not given.")
+    ] = None,
+    preset: Annotated[str | None, typer.Option(help="Kind of worlds of agents; {presets}.")] = None,
     json: Annotated[Path | None, file_option("All figures, as JSON.")] = None,
     npz: Annotated[Path | None, file_option("The sequences found, to replay.")] = None,
     replay: Annotated[
@@ -92,6 +99,9 @@ def attack(
             episodes=episodes,
             seed=seed,
             safety_filter=safety_filter,
+            proved_filter=proved_filter,
+            agents=agents,
+            preset=preset,
         )
         check_outputs({"--json": json, "--npz": npz}, policy_files([policy]))
         _search(settings, json, npz)
@@ -175,6 +185,8 @@ def _line(outcome: Outcome) -> str:
 def verdict(row: Mapping[str, Any]) -> str:
     """Return what an attack came to, in one sentence."""
     worn = "+filter" if row["safety_filter"] else ""
+    if row.get("proved_filter"):
+        worn = "+proved"
     count, name = row["episodes"], f"{row['policy']}{worn}"
     under = f"d̄ = {row['bound']:g}"
     if row["broken_rate"] is None:

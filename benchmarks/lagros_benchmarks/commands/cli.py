@@ -110,7 +110,7 @@ def bench(
     ] = None,
     safety_filter: Annotated[
         str | None,
-        typer.Option(help="Of agents: none, all (policies use it) or both; {safety_filter}."),
+        typer.Option(help="Of agents: none, all (use it), both, or proved; {safety_filter}."),
     ] = None,
     jobs: Annotated[
         int, typer.Option(help="Worker processes; Δt is then measured in a serial pass after.")

@@ -8,7 +8,7 @@ from typing import Any
 
 from lagros_benchmarks.run.experiment import BenchmarkRun, Row
 from lagros_benchmarks.run.room import room_of
-from lagros_benchmarks.run.settings import Case
+from lagros_benchmarks.run.settings import PROVED_FILTER, Case
 from lagros_benchmarks.run.surroundings import machine, own_command, threads, versions
 
 __all__ = ["Row", "episode_objects", "machine", "summarise", "threads", "versions"]
@@ -66,6 +66,7 @@ def _identity(run: BenchmarkRun, case: Case) -> Row:
         "episodes": settings.episodes,
         "seed": settings.seed,
         "safety_filter": case.safety_filter,
+        **({"proved_filter": True} if settings.safety_filter == PROVED_FILTER else {}),
     }
 
 

@@ -24,11 +24,14 @@ from lagros_envs.task import Defaults, Described, Task
 from lagros_policies.backends import LOKY, Backend
 
 CHANNELS = ("all", "rates")
+# The filter with a proof, where a task has one, in place of the usual.
+PROVED_FILTER = "proved"
 # Whether policies fly without a safety filter, with it, or both one after the other.
 SAFETY_FILTERS: dict[str, tuple[bool, ...]] = {
     "none": (False,),
     "all": (True,),
     "both": (False, True),
+    PROVED_FILTER: (True,),
 }
 _USUAL = Defaults()
 # What is kept of an episode lies in memory, and every job is a process.
@@ -130,7 +133,8 @@ class BenchmarkSettings:
         metric: File of the contraction metric for the kind "worst"; None takes the task's own.
         preset: Kind of worlds; None for a task of one body, as the next two.
         agents: Numbers of agents in a world; several compare them.
-        safety_filter: "none", "all" policies use the filter, or "both" one after the other.
+        safety_filter: "none", "all" policies use the filter, "both" one after the other, or
+            "proved": all use the one with a proof.
         policy_settings: Further settings of `lagros_policies.make`, by policy.
         jobs: Worker processes.
         chunk: Episodes that a worker takes at a time; worlds that fly in one batch.

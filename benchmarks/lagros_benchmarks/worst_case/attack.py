@@ -50,6 +50,7 @@ class AttackSettings:
         seed: Seed of the run; its episodes belong to the namespace `ATTACK`.
         search: How to search; in worlds of many agents only optimiser, budget and population.
         safety_filter: Whether the policy uses the safety filter, which worlds of many agents have.
+        proved_filter: Whether it uses the filter with a proof in its place.
         preset: Preset of the scenarios of such worlds.
         agents: Agents in such a world.
 
@@ -65,6 +66,7 @@ class AttackSettings:
     seed: int = 0
     search: SearchSettings = field(default_factory=SearchSettings)
     safety_filter: bool = False
+    proved_filter: bool = False
     preset: str = "paper"
     agents: int = 6
 

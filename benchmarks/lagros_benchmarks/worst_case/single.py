@@ -167,10 +167,11 @@ class SingleBench:
         Raises:
             ValueError: The safety filter is asked for.
         """
-        if settings.safety_filter:
-            raise ValueError(
-                f"safety_filter=True is for worlds of many agents; leave it out for {settings.task}"
-            )
+        for name in ("safety_filter", "proved_filter"):
+            if getattr(settings, name):
+                raise ValueError(
+                    f"{name}=True is for worlds of many agents; leave it out for {settings.task}"
+                )
 
     def prepare(self) -> None:
         """Build everything, and plan the episodes."""

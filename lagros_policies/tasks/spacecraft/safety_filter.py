@@ -10,7 +10,7 @@ own, bit for bit. Nothing is silent: what the filter does is counted.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,18 +19,13 @@ from lagros_envs.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from lagros_envs.checks import check_instance
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
-from lagros_envs.tasks.spacecraft.sensing import Layout
-from lagros_policies.observed import as_numbers
-from lagros_policies.policy import BasePolicy, Policy, PolicyState, as_policy
+from lagros_policies.policy import Policy
 from lagros_policies.safety.barrier import BarrierSettings, BrakingBarrier, HalfPlanes
 from lagros_policies.safety.half_planes import nearest
-from lagros_policies.tasks.spacecraft.sensed import Sensed, WorldState
-from lagros_policies.tasks.spacecraft.setup import task_and_preset
+from lagros_policies.tasks.spacecraft.filtering import ActionFilter
+from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.thrusters import allocate, to_body
 
-Counts = NDArray[np.int64]
-
-COUNTERS = ("filtered_steps", "interventions", "infeasible")
 # A violation below this is rounding [m/s^2].
 _ROUNDING = 1e-6
 # Where not all can be kept, this share of the violation falls to obstacles: a neighbour that comes
@@ -42,23 +37,10 @@ _FACING = 0.7
 _ALREADY_PASSING = 0.05
 
 
-class FilterState(NamedTuple):
-    """What the filter remembers; the inner state comes first.
-
-    Attributes:
-        inner: The state of the inner policy.
-        counts: For each row of the observation the `COUNTERS` of its episode, shape (B, 3).
-    """
-
-    inner: PolicyState
-    counts: Counts
-
-
-class SafetyFilter(BasePolicy):
+class SafetyFilter(ActionFilter):
     """A policy whose actions keep clear of what is sensed.
 
-    It uses what lies within the sensing radius and the radii of the preset, also for an inner
-    policy that observes everything. Every agent is taken to use it: of two agents, each does half.
+    Every agent is taken to use it: of two agents, each does half.
 
     Args:
         policy: The inner policy, of the spacecraft; its actions are those of the environment.
@@ -83,11 +65,7 @@ class SafetyFilter(BasePolicy):
         disturbance_bound: float = 0.4,
         barrier: BarrierSettings | None = None,
     ) -> None:
-        self.policy = as_policy(policy)
-        self.name = f"{self.policy.name}+filter"
-        self.observes = self.policy.observes
-        self.settings, self.preset = task_and_preset(settings, preset, num_agents)
-        self.layout = Layout.for_preset(self.preset, self.settings)
+        super().__init__(policy, settings, preset, num_agents)
         chosen = BarrierSettings.for_bound(disturbance_bound) if barrier is None else barrier
         check_instance("barrier", chosen, BarrierSettings)
         limit = self.settings.thrust_limit
@@ -98,8 +76,6 @@ class SafetyFilter(BasePolicy):
         self._softness = np.repeat(
             [1.0, _OBSTACLE_SOFTNESS, 0.0], [self.layout.neighbours, self.layout.obstacles, 4]
         )
-        thrusters = np.eye(task.THRUSTERS)
-        self._wrench_of_thrust = np.stack(self.settings.system.wrench(list(thrusters)), axis=-1)
         self.barrier = BrakingBarrier(
             chosen,
             self.preset.agent_radius,
@@ -107,58 +83,10 @@ class SafetyFilter(BasePolicy):
             self.settings.control_period,
         )
 
-    def predict(
-        self,
-        observation: Float32Array,
-        state: PolicyState = None,
-        episode_start: BoolArray | None = None,
-        deterministic: bool = True,
-    ) -> tuple[Float32Array, PolicyState]:
-        """Ask the inner policy and filter its actions; see `Policy.predict`.
-
-        Rows are what the inner policy takes, agents or worlds, and so are the actions.
-
-        Raises:
-            ValueError: The observation, the state or the inner action has a wrong shape, or is not
-                finite.
-        """
-        rows = np.atleast_2d(as_numbers(observation, np.float64))
-        if self.observes == "local":
-            sensed = Sensed.of(self.layout, rows)
-        else:
-            world = WorldState.of(self.preset.agents, self.layout.obstacles, rows)
-            sensed = world.sensed(self.settings.sensing_radius)
-        inner, counts = self._remembered(state, len(rows), episode_start)
-        wanted, inner = self.policy.predict(observation, inner, episode_start, deterministic)
-        actions = self._checked(wanted, len(sensed.time))
-        filtered, changed, infeasible = self.filter(actions, sensed)
-        seen = np.stack([np.ones_like(changed), changed, infeasible], axis=-1)
-        counts = counts + seen.reshape(len(rows), -1, len(COUNTERS)).sum(axis=1)
-        return filtered.reshape(np.shape(wanted)), FilterState(inner, counts)
-
-    def counters(self, state: PolicyState) -> dict[str, int]:
-        """Return the inner policy's counters and the filter's own, over the rows of a state.
-
-        `filtered_steps` are the agent-steps seen, `interventions` those whose action was changed,
-        and `infeasible` those at which not everything could be kept clear of, so that the largest
-        violation was made least.
-        """
-        totals = state.counts.sum(axis=0).tolist()
-        return {**self.policy.counters(state.inner), **dict(zip(COUNTERS, totals, strict=True))}
-
-    def reseed(self, generator: np.random.Generator) -> None:
-        """Pass the generator on, if the inner policy draws anything."""
-        self.policy.reseed(generator)
-
-    @property
-    def draws(self) -> bool:
-        """Whether the inner policy takes a generator."""
-        return self.policy.draws
-
-    @property
-    def bare(self) -> BasePolicy:
-        """The inner policy."""
-        return self.policy
+    def _filtered(
+        self, actions: NDArray[Any], sensed: Sensed, memory: FloatArray | None
+    ) -> tuple[Float32Array, BoolArray, BoolArray, FloatArray | None]:
+        return *self.filter(actions, sensed), None
 
     def filter(
         self, actions: NDArray[Any], sensed: Sensed
@@ -175,12 +103,8 @@ class SafetyFilter(BasePolicy):
         """
         filtered = np.array(actions, np.float32)
         infeasible = np.zeros(len(actions), bool)
-        body, h = self.settings.system, self.settings.control_period
-        wrench = task.applied_forces(self.settings, actions) @ self._wrench_of_thrust
-        # The force is held in the body's axes, which turn: take them in the middle of the hold.
-        turn = wrench[:, 2] / (2.0 * body.inertia)
-        middle = sensed.heading + 0.5 * h * sensed.spin + 0.125 * h * h * turn
-        wanted = to_body(wrench[:, :2] / body.mass, -middle)
+        body = self.settings.system
+        wrench, middle, wanted = self.wanted(actions, sensed)
         planes = self.barrier.half_planes(sensed.velocity, *sensed[1:])
         lack = planes.bounds - planes.x * wanted[:, :1] - planes.y * wanted[:, 1:]
         changed: BoolArray = np.max(lack, axis=1) > 0.0
@@ -256,36 +180,6 @@ class SafetyFilter(BasePolicy):
         size = kept.sidestep_rate * blocked * lacking
         push: FloatArray = size[:, None] * along
         return push
-
-    def _remembered(
-        self, state: PolicyState, count: int, episode_start: BoolArray | None
-    ) -> tuple[PolicyState, Counts]:
-        """Return the inner state and the counts so far, which start anew with an episode."""
-        if state is None:
-            return None, np.zeros((count, len(COUNTERS)), np.int64)
-        if not isinstance(state, FilterState) or len(state.counts) != count:
-            raise ValueError(
-                f"state must be what the filter returned for these {count} rows, or None at the "
-                "start of an episode"
-            )
-        if episode_start is None:
-            return state.inner, state.counts
-        starts = np.ravel(episode_start).astype(bool)
-        if len(starts) != count:
-            raise ValueError(f"episode_start has {len(starts)} entries; {count} rows are observed")
-        return state.inner, np.where(starts[:, None], 0, state.counts)
-
-    def _checked(self, wanted: Any, agents: int) -> NDArray[Any]:
-        """Return the inner actions, one row per agent."""
-        actions = np.asarray(wanted)
-        if actions.size != agents * task.THRUSTERS or actions.shape[-1:] != (task.THRUSTERS,):
-            raise ValueError(
-                f"{self.policy.name} answered with shape {actions.shape} for {agents} agents; an "
-                f"action has {task.THRUSTERS} numbers for each"
-            )
-        if not np.all(np.isfinite(actions)):
-            raise ValueError(f"the action of {self.policy.name} is not finite")
-        return actions.reshape(agents, task.THRUSTERS)
 
 
 def _body_axes(heading: FloatArray) -> FloatArray:

@@ -157,7 +157,7 @@ def world_tube(
         around, push = motion + sizes[:, :2], sizes[:, 2]
         sensed = _SINGLE * around
         felt = _SINGLE * np.array([planned.heading + angles[0], angles[1]])
-        forces, spins = _rounding(body, push, angles[2])
+        forces, spins = thrust_rounding(body, push, angles[2])
         noise = sensed @ np.abs(plane.gain) + forces
         noise_turn = float(felt @ np.abs(turning.gain) + np.max(spins))
         beside = float(felt.sum()) + plane.period**2 * noise_turn
@@ -206,7 +206,9 @@ def _shortfall(motion: FloatArray, accelerations: FloatArray, period: float) -> 
     return np.stack(sizes, axis=-1) * (1.0 + SUM)
 
 
-def _rounding(body: Spacecraft, push: FloatArray, turn: float) -> tuple[FloatArray, FloatArray]:
+def thrust_rounding(
+    body: Spacecraft, push: FloatArray, turn: float
+) -> tuple[FloatArray, FloatArray]:
     """Bound what single precision of the eight forces does to the accelerations, both (n,)."""
     torque = 2.0 * body.inertia * turn
     arms = body.arm + body.side_arm

@@ -66,6 +66,8 @@ class SpacecraftBench:
                 f"--method {settings.search.method}: {settings.task} has one search only; leave "
                 "--method out"
             )
+        if settings.safety_filter and settings.proved_filter:
+            raise ValueError("safety_filter and proved_filter: a policy wears one of them")
 
     def prepare(self) -> None:
         """Build everything that flies."""
@@ -81,9 +83,9 @@ class SpacecraftBench:
         first = make_single_policy(settings.policy, env)
         WorldsLoop(env, first).rehearse(f"policy {settings.policy!r}", [0])
         policy = make_single_policy(settings.policy, env)
-        if settings.safety_filter:
+        if settings.safety_filter or settings.proved_filter:
             with building(f"policy {settings.policy!r} with the safety filter"):
-                policy = make_filter(policy, env, settings.bound)
+                policy = make_filter(policy, env, settings.bound, settings.proved_filter)
         margin = position_margin(policy, settings.bound)
         return [
             SpacecraftTarget(

@@ -217,11 +217,15 @@ def shapes_of(policy: BasePolicy, worlds: int, agents: int) -> list[tuple[int, .
     return [rows, (worlds, agents, THRUSTERS), (worlds, agents * THRUSTERS)]
 
 
-def make_filter(policy: BasePolicy, env: Any, disturbance_bound: float) -> BasePolicy:
-    """Return a policy with the safety filter of an environment's task and preset, at a bound."""
+def make_filter(
+    policy: BasePolicy, env: Any, disturbance_bound: float, proved: bool = False
+) -> BasePolicy:
+    """Return a policy with a safety filter of an environment's task and preset, at a bound."""
+    from lagros_policies.tasks.spacecraft.proved_filter import ProvedFilter
     from lagros_policies.tasks.spacecraft.safety_filter import SafetyFilter
 
-    return SafetyFilter(policy, env.settings, env.preset, disturbance_bound=disturbance_bound)
+    chosen = ProvedFilter if proved else SafetyFilter
+    return chosen(policy, env.settings, env.preset, disturbance_bound=disturbance_bound)
 
 
 def fly(

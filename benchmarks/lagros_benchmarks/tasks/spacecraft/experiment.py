@@ -13,7 +13,7 @@ from lagros_benchmarks.run.episodes import added_up
 from lagros_benchmarks.run.experiment import BenchmarkRun
 from lagros_benchmarks.run.keeping import Kept
 from lagros_benchmarks.run.library import Toolbox, building, built_policy
-from lagros_benchmarks.run.settings import BenchmarkSettings, Case
+from lagros_benchmarks.run.settings import PROVED_FILTER, BenchmarkSettings, Case
 from lagros_benchmarks.run.workers import Progress
 from lagros_benchmarks.tasks.spacecraft.claims import position_margin, tracked_with_a_gain
 from lagros_benchmarks.tasks.spacecraft.episodes import (
@@ -133,6 +133,8 @@ class SpacecraftExperiment:
         if not case.safety_filter:
             return policy
         with building(f"policy {name!r} with the safety filter"):
+            if self.settings.safety_filter == PROVED_FILTER:
+                return make_filter(policy, env, bound, proved=True)
             return (self.toolbox.make_filter or make_filter)(policy, env, bound)
 
     def units(self, progress: Progress | None, keeper: Kept | None = None) -> list[int]:

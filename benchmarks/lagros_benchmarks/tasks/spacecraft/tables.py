@@ -107,7 +107,8 @@ def columns(row: Row) -> tuple[Column, ...]:
 def title(row: Row) -> str:
     """Return the title of the table of a condition, on two lines; the row is its first."""
     worlds = f"{row['episodes']} world{'' if row['episodes'] == 1 else 's'}, seed {row['seed']}"
-    worlds += ", all with the safety filter" if row["safety_filter"] else ""
+    which = "proved" if row.get("proved_filter") else "safety"
+    worlds += f", all with the {which} filter" if row["safety_filter"] else ""
     return f"{task_title(row)}, {disturbance_title(row)},\n{worlds}"
 
 

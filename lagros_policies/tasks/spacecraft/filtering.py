@@ -1,0 +1,203 @@
+"""What the filters of the spacecraft share: a policy is asked, and its actions are changed.
+
+Where nothing is to be changed the action is the policy's own, bit for bit. Nothing is silent: what
+a filter does is counted.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
+from lagros_envs.tasks.spacecraft import task
+from lagros_envs.tasks.spacecraft.scenarios import Preset
+from lagros_envs.tasks.spacecraft.sensing import Layout
+from lagros_policies.observed import as_numbers
+from lagros_policies.policy import BasePolicy, Policy, PolicyState, as_policy
+from lagros_policies.tasks.spacecraft.sensed import Sensed, WorldState
+from lagros_policies.tasks.spacecraft.setup import task_and_preset
+from lagros_policies.tasks.spacecraft.thrusters import to_body
+
+Counts = NDArray[np.int64]
+
+COUNTERS = ("filtered_steps", "interventions", "infeasible")
+
+
+class FilterState(NamedTuple):
+    """What a filter remembers; the inner state comes first.
+
+    Attributes:
+        inner: The state of the inner policy.
+        counts: For each row of the observation the `COUNTERS` of its episode, shape (B, 3).
+        memory: What the filter itself remembers, one row per agent, nan where nothing; None for a
+            filter that remembers nothing.
+    """
+
+    inner: PolicyState
+    counts: Counts
+    memory: FloatArray | None = None
+
+
+class Wanted(NamedTuple):
+    """What actions do over a hold.
+
+    Attributes:
+        wrench: In the body's axes, shape (B, 3) [N, N, N m].
+        middle: Heading in the middle of the hold, shape (B,) [rad].
+        acceleration: Of position, in the world's axes, shape (B, 2) [m/s^2].
+    """
+
+    wrench: FloatArray
+    middle: FloatArray
+    acceleration: FloatArray
+
+
+class ActionFilter(BasePolicy):
+    """A policy whose actions a filter changes.
+
+    It uses what lies within the sensing radius and the radii of the preset, also for an inner
+    policy that observes everything.
+
+    Args:
+        policy: The inner policy, of the spacecraft; its actions are those of the environment.
+        settings: The task.
+        preset: The preset, or its name: the layout of the observation and the radii.
+        num_agents: Number of agents; None for the preset's own.
+
+    Raises:
+        TypeError: The inner policy is not one.
+        ValueError: A value is out of range.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        settings: task.SpacecraftSettings | None = None,
+        preset: str | Preset = "paper",
+        num_agents: int | None = None,
+    ) -> None:
+        self.policy = as_policy(policy)
+        self.name = f"{self.policy.name}+filter"
+        self.observes = self.policy.observes
+        self.settings, self.preset = task_and_preset(settings, preset, num_agents)
+        self.layout = Layout.for_preset(self.preset, self.settings)
+        thrusters = np.eye(task.THRUSTERS)
+        self._wrench_of_thrust = np.stack(self.settings.system.wrench(list(thrusters)), axis=-1)
+
+    def wanted(self, actions: NDArray[Any], sensed: Sensed) -> Wanted:
+        """Return what actions do over a hold.
+
+        The force is held in the body's axes, which turn: they are taken in the middle of the hold.
+
+        Args:
+            actions: One per agent, shape (B, 8), in units of `settings.thrust_scale`.
+            sensed: What the agents sense.
+        """
+        body, h = self.settings.system, self.settings.control_period
+        wrench = task.applied_forces(self.settings, actions) @ self._wrench_of_thrust
+        turn = wrench[:, 2] / (2.0 * body.inertia)
+        middle = sensed.heading + 0.5 * h * sensed.spin + 0.125 * h * h * turn
+        return Wanted(wrench, middle, to_body(wrench[:, :2] / body.mass, -middle))
+
+    def _filtered(
+        self, actions: NDArray[Any], sensed: Sensed, memory: FloatArray | None
+    ) -> tuple[Float32Array, BoolArray, BoolArray, FloatArray | None]:
+        """Return actions, which were changed, where not all could be kept, and what to remember.
+
+        Args:
+            actions: One per agent, shape (B, 8), in units of `settings.thrust_scale`.
+            sensed: What the agents sense.
+            memory: What was remembered, shape (B, q), nan where an episode begins; None at the
+                first call.
+        """
+        raise NotImplementedError
+
+    def predict(
+        self,
+        observation: Float32Array,
+        state: PolicyState = None,
+        episode_start: BoolArray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, PolicyState]:
+        """Ask the inner policy and filter its actions; see `Policy.predict`.
+
+        Rows are what the inner policy takes, agents or worlds, and so are the actions.
+
+        Raises:
+            ValueError: The observation, the state or the inner action has a wrong shape, or is not
+                finite.
+        """
+        rows = np.atleast_2d(as_numbers(observation, np.float64))
+        if self.observes == "local":
+            sensed = Sensed.of(self.layout, rows)
+        else:
+            world = WorldState.of(self.preset.agents, self.layout.obstacles, rows)
+            sensed = world.sensed(self.settings.sensing_radius)
+        inner, counts, memory = self._remembered(state, len(rows), episode_start)
+        wanted, inner = self.policy.predict(observation, inner, episode_start, deterministic)
+        actions = self._checked(wanted, len(sensed.time))
+        filtered, changed, infeasible, memory = self._filtered(actions, sensed, memory)
+        seen = np.stack([np.ones_like(changed), changed, infeasible], axis=-1)
+        counts = counts + seen.reshape(len(rows), -1, len(COUNTERS)).sum(axis=1)
+        return filtered.reshape(np.shape(wanted)), FilterState(inner, counts, memory)
+
+    def counters(self, state: PolicyState) -> dict[str, int]:
+        """Return the inner policy's counters and the filter's own, over the rows of a state.
+
+        `filtered_steps` are the agent-steps seen, `interventions` those whose action was changed,
+        and `infeasible` those at which not everything could be kept clear of, so that the largest
+        violation was made least.
+        """
+        totals = state.counts.sum(axis=0).tolist()
+        return {**self.policy.counters(state.inner), **dict(zip(COUNTERS, totals, strict=True))}
+
+    def reseed(self, generator: np.random.Generator) -> None:
+        """Pass the generator on, if the inner policy draws anything."""
+        self.policy.reseed(generator)
+
+    @property
+    def draws(self) -> bool:
+        """Whether the inner policy takes a generator."""
+        return self.policy.draws
+
+    @property
+    def bare(self) -> BasePolicy:
+        """The inner policy."""
+        return self.policy
+
+    def _remembered(
+        self, state: PolicyState, count: int, episode_start: BoolArray | None
+    ) -> FilterState:
+        """Return the inner state and what was counted, which starts anew with an episode."""
+        if state is None:
+            return FilterState(None, np.zeros((count, len(COUNTERS)), np.int64))
+        if not isinstance(state, FilterState) or len(state.counts) != count:
+            raise ValueError(
+                f"state must be what the filter returned for these {count} rows, or None at the "
+                "start of an episode"
+            )
+        if episode_start is None:
+            return state
+        starts = np.ravel(episode_start).astype(bool)
+        if len(starts) != count:
+            raise ValueError(f"episode_start has {len(starts)} entries; {count} rows are observed")
+        memory = state.memory
+        if memory is not None:
+            begins = np.repeat(starts, len(memory) // count)
+            memory = np.where(begins[:, None], np.nan, memory)
+        return FilterState(state.inner, np.where(starts[:, None], 0, state.counts), memory)
+
+    def _checked(self, wanted: Any, agents: int) -> NDArray[Any]:
+        """Return the inner actions, one row per agent."""
+        actions = np.asarray(wanted)
+        if actions.size != agents * task.THRUSTERS or actions.shape[-1:] != (task.THRUSTERS,):
+            raise ValueError(
+                f"{self.policy.name} answered with shape {actions.shape} for {agents} agents; an "
+                f"action has {task.THRUSTERS} numbers for each"
+            )
+        if not np.all(np.isfinite(actions)):
+            raise ValueError(f"the action of {self.policy.name} is not finite")
+        return actions.reshape(agents, task.THRUSTERS)
