@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from lagros_benchmarks.report.records import summarise
 from lagros_benchmarks.run.library import SetupError
 from lagros_benchmarks.run.runner import Case, fly_scene, run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings, Condition
@@ -215,3 +216,14 @@ def test_a_scene_is_one_world_of_the_run():
             np.testing.assert_allclose(ends, [a.goal_distance for a in record.agents], atol=1e-4)
     with pytest.raises(ValueError, match="0 to 3"):
         fly_scene(settings, 4, fakes.TOOLBOX)
+
+
+def test_the_filter_with_a_proof_flies_by_name():
+    settings = settings_of("spring", episodes=2, safety_filter="proved")
+    run = run_benchmark(settings, fakes.TOOLBOX)
+    (case,) = settings.cases
+    assert case.safety_filter
+    assert run.counters[case]["infeasible"] == 0
+    assert not any(agent.collided for world in run.episodes[case] for agent in world.agents)
+    (row,) = summarise(run)
+    assert row["proved_filter"]

@@ -20,6 +20,7 @@ from lagros_benchmarks.commands.terminal import (
     options_given,
     progress_bar,
     refuse_options,
+    task_in_preset,
 )
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ def attack(
             return
         if method == "cma":
             check_extra("--method cma", "attack")
+        task, preset = task_in_preset(task, preset)
         settings = AttackSettings.for_task(
             task,
             method,

@@ -10,7 +10,7 @@ import numpy as np
 
 from lagros_benchmarks.run.metrics import wilson_interval
 from lagros_benchmarks.run.room import room_of
-from lagros_benchmarks.run.settings import check_policy
+from lagros_benchmarks.run.settings import check_fits, check_policy
 from lagros_benchmarks.run.workers import Progress, untold
 from lagros_benchmarks.worst_case.replay import Outcome, WorstCases
 from lagros_benchmarks.worst_case.search import MOST, Found, SearchSettings
@@ -85,8 +85,14 @@ class AttackSettings:
 
     @classmethod
     def for_task(cls, task: str, method: str, budget: int | None, **given: Any) -> AttackSettings:
-        """Return the settings of a task, with its own defaults for what is None."""
+        """Return the settings of a task, with its own defaults for what is None.
+
+        Raises:
+            ValueError: A setting is not valid, or is for worlds of many agents and the task is one
+                body.
+        """
         described = find_any(task)
+        check_fits(described, agents=given.get("agents"), preset=given.get("preset"))
         usual = described.defaults
         bench = bench_of(described.name)
         search = SearchSettings(
