@@ -9,8 +9,8 @@ every agent arriving. (c) has no rate; it is flown as it ships, with and without
         [--rates 0.5,0.7,1,1.5,2,3,4] [--policies centralized,tube-mpc,lagros] [--json FILE]
         [--markdown FILE] [--figure FILE]
 
-Rows that the file of `--json` has of the same worlds are kept and not flown again; table and figure
-are of all of them.
+Rows that the file of `--json` has of the same worlds are kept and not flown again. The table is of
+all of them, the figure of those at the bounds that are asked for.
 """
 
 from __future__ import annotations
@@ -135,25 +135,30 @@ def markdown(rows: list[dict[str, Any]]) -> str:
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Draw strict success against the effort over the same time, a line for each law."""
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
     bounds = sorted({row["bound"] for row in rows})
+    lines = sorted({(row["policy"], row.get("law", ""), row["safety_filter"]) for row in rows})
     figure, axes = plt.subplots(1, len(bounds), figsize=(4.2 * len(bounds), 3.6), squeeze=False)
     for axis, bound in zip(axes[0], bounds, strict=True):
-        chosen = [row for row in rows if row["bound"] == bound]
-        labels = dict.fromkeys((r["policy"], r.get("law", ""), r["safety_filter"]) for r in chosen)
-        for policy, law, filtered in labels:
+        for colour, (policy, law, filtered) in enumerate(lines):
             line = [
-                (row["effort_total_mean"], 100 * row["strict_success_rate"], row)
-                for row in chosen
-                if (row["policy"], row.get("law", ""), row["safety_filter"])
-                == (policy, law, filtered)
+                row
+                for row in rows
+                if (row["policy"], row.get("law", ""), row["safety_filter"], row["bound"])
+                == (policy, law, filtered, bound)
             ]
+            if not line:
+                continue
+            line.sort(key=lambda row: row.get("contraction_rate", 0.0))
+            points = [(row["effort_total_mean"], 100 * row["strict_success_rate"]) for row in line]
             name = " ".join(part for part in (policy, law, "+ filter" if filtered else "") if part)
-            axis.plot(*zip(*[point[:2] for point in line], strict=True), "o-", label=name)
-            for x, y, row in line:
-                if "contraction_rate" in row and law == "gain":
-                    axis.annotate(f"{row['contraction_rate']:g}", (x, y), fontsize=7)
+            axis.plot(*zip(*points, strict=True), "o-", color=f"C{colour}", label=name)
+            for point, row in zip(points, line, strict=True):
+                if law == "gain":
+                    axis.annotate(f"{row['contraction_rate']:g}", point, fontsize=7)
         axis.set(title=f"d̄ = {bound:g}", xlabel="∫‖u‖² to 45 s [N²s]", xscale="log")
+        axis.xaxis.set_minor_formatter(NullFormatter())
     axes[0, 0].set_ylabel("strict success [%]")
     axes[0, -1].legend(fontsize=7)
     figure.tight_layout()
@@ -183,7 +188,8 @@ def main() -> None:
         rows = [row for row in rows if row["worlds"] == options.worlds]
     flown = [_key(row) for row in rows]
     console = Console()
-    for bound in (float(part) for part in options.bound.split(",")):
+    bounds = [float(part) for part in options.bound.split(",")]
+    for bound in bounds:
         for variant in variants(options.policies.split(","), rates):
             name, given, filtered = variant
             if _key({"policy": name, **given, "safety_filter": filtered, "bound": bound}) in flown:
@@ -195,7 +201,7 @@ def main() -> None:
     if options.markdown is not None:
         write_atomic(options.markdown, markdown(rows) + "\n")
     if options.figure is not None:
-        draw(rows, options.figure)
+        draw([row for row in rows if row["bound"] in bounds], options.figure)
 
 
 if __name__ == "__main__":
