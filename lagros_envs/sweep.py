@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from lagros_envs.arrays import BoolArray, FloatArray, IntArray
+from lagros_envs.arrays import BoolArray, FloatArray
+from lagros_envs.cells import Offsets, all_beside, all_pairs
 
 
 class Path(NamedTuple):
@@ -31,12 +31,14 @@ class Path(NamedTuple):
         return cls(points, bulge, np.sqrt(np.max(squares, axis=0)) + bulge)
 
 
-def swept_agents(path: Path, contact: FloatArray) -> BoolArray:
+def swept_agents(path: Path, contact: FloatArray, near: Offsets | None = None) -> BoolArray:
     """Tell which agents came too close to another agent of their world on the way.
 
     Args:
         path: How the agents moved.
         contact: Distance of centres at which two agents of a world touch, shape (worlds,) [m].
+        near: Pairs of agents, as they lie at the end, among which all are that can have met; None
+            for all pairs.
 
     Returns:
         Shape (worlds, agents). The bulge of the paths counts as contact: a pass that is closer than
@@ -44,71 +46,63 @@ def swept_agents(path: Path, contact: FloatArray) -> BoolArray:
     """
     points, bulge, reach = path
     worlds, agents = bulge.shape
-    hit = np.zeros((worlds, agents), bool)
-    if agents == 1:
-        return hit
-    first, second, places, other_places = _pairs(worlds, agents)
-    x, y, reaches = (part.reshape(-1) for part in (*points[-1], reach))
-    # Who is further apart at the end than both have moved and need cannot have met.
-    square = np.square(x.take(other_places) - x.take(places))
-    square += np.square(y.take(other_places) - y.take(places))
-    limit = reaches.take(places) + reaches.take(other_places)
-    limit += contact[:, None]
-    world, pair = _places(square <= np.square(limit, out=limit))
-    if world.size:
-        one, other = first[pair], second[pair]
-        offsets = points[:, :, world, other] - points[:, :, world, one]
-        limit = contact[world] + bulge[world, one] + bulge[world, other]
-        met = closest_approach(offsets) < limit
-        hit[world[met], one[met]] = True
-        hit[world[met], other[met]] = True
-    return hit
+    hit = np.zeros(worlds * agents, bool)
+    flat = points.reshape(len(points), 2, -1)
+    if near is None:
+        near = Offsets.between(all_pairs(worlds, agents), flat[-1], flat[-1])
+    # Who is further apart at the end than both have moved and need cannot have met; first for all
+    # as for the fastest and widest.
+    most = 2.0 * float(reach.max()) + float(contact.max())
+    met = np.flatnonzero(near.square <= most * most)
+    one, other = near.one[met], near.other[met]
+    touch, reaches, curves = np.repeat(contact, agents), reach.reshape(-1), bulge.reshape(-1)
+    limit = reaches[one] + reaches[other] + touch[one]
+    kept = near.square[met] <= limit * limit
+    if kept.any():
+        one, other = one[kept], other[kept]
+        offsets = flat[:, :, other] - flat[:, :, one]
+        close = closest_approach(offsets) < touch[one] + curves[one] + curves[other]
+        hit[one[close]] = True
+        hit[other[close]] = True
+    return hit.reshape(worlds, agents)
 
 
-def swept_obstacles(path: Path, centres: FloatArray, contact: FloatArray) -> BoolArray:
+def swept_obstacles(
+    path: Path, centres: FloatArray, contact: FloatArray, near: Offsets | None = None
+) -> BoolArray:
     """Tell which agents came too close to an obstacle on the way.
 
     Args:
         path: How the agents moved.
-        centres: Of the obstacles, the same for all agents of a world, shape (2, obstacles, worlds,
-            agents) [m].
-        contact: Distance of centres at which an agent touches, shape (obstacles, worlds, agents)
-            [m]; negative where there is no obstacle.
+        centres: Of the obstacles, shape (2, worlds, obstacles) [m].
+        contact: Distance of centres at which an agent touches, shape (worlds, obstacles) [m];
+            -inf where there is no obstacle.
+        near: Pairs of an agent and an obstacle, as they lie at the end, among which all are that
+            can have met; None for all pairs.
 
     Returns:
         Shape (worlds, agents).
     """
     points, bulge, reach = path
-    hit = np.zeros(bulge.shape, bool)
-    x, y = points[-1]
-    square = x - centres[0]
-    square *= square
-    offset = y - centres[1]
-    offset *= offset
-    square += offset
+    worlds, agents = bulge.shape
+    hit = np.zeros(worlds * agents, bool)
+    flat, discs = points.reshape(len(points), 2, -1), centres.reshape(2, -1)
+    if near is None:
+        pairs = all_beside(worlds, agents, contact.shape[1])
+        near = Offsets.between(pairs, flat[-1], discs)
+    touch = contact.reshape(-1)
     # An absent obstacle has the contact -inf; its square must not count.
-    limit = np.add(reach, contact, out=offset)
-    np.maximum(limit, 0.0, out=limit)
-    limit *= limit
-    obstacle, world, agent = _places(square <= limit)
-    if world.size:
-        offsets = points[:, :, world, agent] - centres[:, obstacle, world, agent]
-        met = closest_approach(offsets) < contact[obstacle, world, agent] + bulge[world, agent]
-        hit[world[met], agent[met]] = True
-    return hit
-
-
-@lru_cache(maxsize=8)
-def _pairs(worlds: int, agents: int) -> tuple[IntArray, ...]:
-    """Return the two agents of each pair, and where they are in (worlds * agents,)."""
-    first, second = np.triu_indices(agents, 1)
-    begin = agents * np.arange(worlds)[:, None]
-    return first, second, begin + first, begin + second
-
-
-def _places(mask: BoolArray) -> tuple[IntArray, ...]:
-    """Return what `np.nonzero` does; where little is true that takes five times as long."""
-    return np.unravel_index(np.flatnonzero(mask), mask.shape)
+    most = max(0.0, float(reach.max()) + float(touch.max()))
+    met = np.flatnonzero(near.square <= most * most)
+    agent, disc = near.one[met], near.other[met]
+    limit = np.maximum(touch[disc] + reach.reshape(-1)[agent], 0.0)
+    kept = near.square[met] <= limit * limit
+    if kept.any():
+        agent, disc = agent[kept], disc[kept]
+        offsets = flat[:, :, agent] - discs[:, disc]
+        close = closest_approach(offsets) < touch[disc] + bulge.reshape(-1)[agent]
+        hit[agent[close]] = True
+    return hit.reshape(worlds, agents)
 
 
 def closest_approach(offsets: FloatArray) -> FloatArray:
@@ -120,10 +114,10 @@ def closest_approach(offsets: FloatArray) -> FloatArray:
     Returns:
         Shape (...).
     """
-    start, way = offsets[:-1], np.diff(offsets, axis=0)
+    start, way = offsets[:-1], offsets[1:] - offsets[:-1]
     length = np.einsum("sc...,sc...->s...", way, way)
     along = -np.einsum("sc...,sc...->s...", start, way)
-    share = np.clip(along / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
+    share = np.minimum(np.maximum(along / np.where(length > 0.0, length, 1.0), 0.0), 1.0)
     nearest = start + share[:, None] * way
     least: FloatArray = np.min(np.hypot(nearest[:, 0], nearest[:, 1]), axis=0)
     return least

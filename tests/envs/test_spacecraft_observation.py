@@ -30,9 +30,15 @@ def world_of(*scenarios, obstacles=6, steps=0, **settings):
     return world
 
 
+def layout_of(world):
+    """A slot for everybody."""
+    time_limit = world.settings.time_limit
+    return Layout(max(1, world.agents - 1), max(1, world.obstacles), time_limit)
+
+
 def named(world):
     """Observations by world, agent and name."""
-    layout = Layout.of(world)
+    layout = layout_of(world)
     rows = observe(world, layout)
     assert rows.dtype == np.float32
     assert rows.shape == (world.worlds, world.agents, layout.size)
@@ -113,7 +119,7 @@ def test_nothing_beyond_the_disc_changes_what_is_seen():
         starts[2] = far
         obstacles = [[0.0, 2.0], [far[1], far[0]]]
         world = world_of(Scenario(starts, np.zeros(3), goals, obstacles, [0.5, 0.4]))
-        seen.append(observe(world, Layout.of(world))[0, 0])
+        seen.append(observe(world, layout_of(world))[0, 0])
     np.testing.assert_array_equal(*seen)
     assert np.count_nonzero(seen[0]) == 8  # goal, cos phi, and one of each kind with its mask
 
@@ -150,7 +156,7 @@ def test_renumbering_agents_and_obstacles_permutes_the_slots():
 
 def test_flattening_the_named_parts_gives_the_observation_back():
     world = world_of(paper(0), steps=3)
-    layout = Layout.of(world)
+    layout = layout_of(world)
     for row in observe(world, layout)[0]:
         parts = spaces.unflatten(layout.named_space, row)
         assert list(parts) == list(layout.shapes)
@@ -162,7 +168,7 @@ def test_flattening_the_named_parts_gives_the_observation_back():
 
 def test_a_caller_who_goes_on_past_the_limit_stays_in_the_space():
     world = world_of(paper(0), steps=5, time_limit=0.3)
-    layout = Layout.of(world)
+    layout = layout_of(world)
     space = spaces.flatten_space(layout.named_space)
     assert all(space.contains(row) for row in observe(world, layout)[0])
     space = spaces.flatten_space(named_state_space(6, 6, 0.3))

@@ -160,8 +160,7 @@ def test_no_collision_of_random_paths_is_missed(seed, agents):
     reach[rng.random((worlds, 3)) < 0.3] = -np.inf
     offsets = fine[..., :, None] - centres[:, :, None]
     gaps = np.min(np.hypot(offsets[:, 0], offsets[:, 1]), axis=0) - reach[:, None]
-    by_agent = np.repeat(np.moveaxis(centres, 1, 2)[..., None], agents, axis=-1)
-    hit = swept_obstacles(path, by_agent, np.repeat(reach.T[..., None], agents, axis=-1))
+    hit = swept_obstacles(path, centres, reach)
     assert np.all(hit[gaps.min(axis=2) < -1e-9])
     assert not np.any(hit[gaps.min(axis=2) > 0.02])
 

@@ -69,7 +69,7 @@ class SpacecraftEpisode:
             self.settings,
             compiled,
         )
-        self.layout = Layout.of(self.world)
+        self.layout = Layout.for_preset(self.preset, self.settings)
         self.started = False
         self.end = End.NOT_YET
 

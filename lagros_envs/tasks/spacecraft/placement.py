@@ -28,6 +28,18 @@ def most_apart(arena: float, apart: float) -> int:
     return math.floor(bound * (1.0 + 1e-12)) if math.isfinite(bound) else sys.maxsize
 
 
+def most_apart_in_disc(radius: float, apart: float) -> int:
+    """Return the same bound for a disc: 2 / sqrt(3) area / d^2 + perimeter / 2 d + 1 (Oler 1961).
+
+    Args:
+        radius: Of the disc [m].
+        apart: Least distance between two of the points, above zero [m].
+    """
+    ratio = radius / apart
+    bound = 2.0 / math.sqrt(3.0) * math.pi * ratio * ratio + math.pi * ratio + 1.0
+    return math.floor(bound * (1.0 + 1e-12)) if math.isfinite(bound) else sys.maxsize
+
+
 def scatter(rng: np.random.Generator, arena: float, count: int, apart: float) -> FloatArray | None:
     """Place points one by one, uniformly in a square.
 

@@ -12,7 +12,13 @@ import numpy as np
 from lagros_envs.arrays import FloatArray
 from lagros_envs.checks import check_fields, check_not_negative, check_whole, shown, suggestion
 from lagros_envs.conventions import built_like
-from lagros_envs.tasks.spacecraft.placement import Room, clear, most_apart, scatter
+from lagros_envs.tasks.spacecraft.placement import (
+    Room,
+    clear,
+    most_apart,
+    most_apart_in_disc,
+    scatter,
+)
 from lagros_envs.tasks.spacecraft.reachable import shut_in, way_exists
 from lagros_envs.tasks.spacecraft.scenario import LARGEST, MOST_AGENTS, MOST_OBSTACLES, Scenario
 from lagros_envs.values import use_plain_numbers
@@ -111,6 +117,24 @@ class Preset:
     def aside(self) -> float:
         """Room that starts and goals keep beside obstacles [m]."""
         return self.margin if self.obstacle_margin is None else self.obstacle_margin
+
+    def most_neighbours(self, radius: float) -> int:
+        """Return how many others fit around an agent, within a radius [m], while none touch."""
+        return most_apart_in_disc(radius, 2.0 * self.agent_radius) - 1
+
+    def most_obstacles(self, radius: float) -> int:
+        """Return how many obstacles have a part within a radius [m] of an agent.
+
+        Where they may overlap it is more than any draw has: 10 + 8 standard deviations beyond the
+        mean number.
+        """
+        if self.rectangle_sides is None:
+            passage = self.core + self.margin if self.open_passages else 0.0
+            reach, apart = radius + self.obstacle_radius, 2.0 * (self.obstacle_radius + passage)
+            return most_apart_in_disc(reach, apart)
+        reach = radius + self.rectangle_sides[1] / math.sqrt(math.pi)
+        mean = self.obstacle_count[1] * math.pi * (reach / self.arena) ** 2
+        return math.ceil(mean + 8.0 * math.sqrt(mean) + 10.0)
 
     def for_agents(self, num_agents: int | None = None) -> Preset:
         """Return the preset with its sizes for this many agents.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -18,16 +18,14 @@ from lagros_envs.tasks.spacecraft.world import SpacecraftWorld
 
 NEIGHBOUR_DIM = 4  # relative position and velocity
 OBSTACLE_DIM = 3  # relative position and radius
-_APART = 16
 
 
 @dataclass(frozen=True)
 class Layout:
     """Where each named part of an agent's observation lies.
 
-    The number of slots is fixed, and each of the other agents and of the obstacles has one; a slot
-    is zero, and so is its mask, unless what it belongs to is sensed. No order among the slots
-    means anything.
+    The number of slots is fixed; a slot is zero, and so is its mask, unless something is sensed
+    there. No order among the slots means anything.
 
     Attributes:
         neighbours: Slots for other agents.
@@ -40,14 +38,16 @@ class Layout:
     time_limit: float
 
     @classmethod
-    def of(cls, world: SpacecraftWorld) -> Layout:
-        """Return the layout for a world; there is always one slot of each kind."""
-        return cls(max(1, world.agents - 1), max(1, world.obstacles), world.settings.time_limit)
-
-    @classmethod
     def for_preset(cls, preset: Preset, settings: SpacecraftSettings) -> Layout:
-        """Return the layout for the worlds of a preset, whose `agents` is their number."""
-        return cls(max(1, preset.agents - 1), max(1, preset.obstacle_count[1]), settings.time_limit)
+        """Return the layout for the worlds of a preset, whose `agents` is their number.
+
+        There is a slot for every body that can be sensed at once while none touch, and always one.
+        """
+        return cls(
+            max(1, min(preset.agents - 1, preset.most_neighbours(settings.sensing_radius))),
+            max(1, min(preset.obstacle_count[1], preset.most_obstacles(settings.sensing_radius))),
+            settings.time_limit,
+        )
 
     @property
     def shapes(self) -> OrderedDict[str, tuple[int, ...]]:
@@ -106,18 +106,7 @@ def _boxes(
     return spaces.Dict(boxes)
 
 
-def observation_columns(world: SpacecraftWorld, layout: Layout) -> Float32Array:
-    """Return room for the observations of all agents, one row for each entry.
-
-    Rows a multiple of a page apart would share their place in the cache.
-    """
-    rows = world.worlds * world.agents
-    return np.zeros((layout.size, rows + _APART), np.float32)[:, :rows]
-
-
-def observe(
-    world: SpacecraftWorld, layout: Layout, columns: Float32Array | None = None
-) -> Float32Array:
+def observe(world: SpacecraftWorld, layout: Layout) -> Float32Array:
     """Return the observation of every agent.
 
     Another agent is sensed when its centre, and an obstacle when any part of it, is no further from
@@ -125,67 +114,108 @@ def observe(
 
     Args:
         world: The worlds.
-        layout: `Layout.of(world)`.
-        columns: What `observation_columns` returned for them, to be used again and again: fresh
-            memory costs as much as the observation.
+        layout: That of their preset.
 
     Returns:
         Shape (worlds, agents, layout.size), a new array.
     """
     worlds, agents, at = world.worlds, world.agents, layout.slices
-    # One entry after the other, each over all agents of all worlds, and turned at the end.
-    columns = observation_columns(world, layout) if columns is None else columns
-    parts = columns.reshape(-1, worlds, agents)
+    rows = np.zeros((worlds * agents, layout.size), np.float32)
+    own = rows[:, : at["neighbours"].start].reshape(worlds, agents, -1)
     x, y, heading, velocity_x, velocity_y, spin = world.parts
-    np.subtract(world.goals[0], x, out=parts[0], casting="same_kind")
-    np.subtract(world.goals[1], y, out=parts[1], casting="same_kind")
-    parts[2], parts[3] = velocity_x, velocity_y
-    parts[4], parts[5] = np.cos(heading), np.sin(heading)
-    np.subtract(heading, world.start_headings, out=parts[6], casting="same_kind")
-    parts[7] = spin
+    own[..., 0], own[..., 1] = world.goals[0] - x, world.goals[1] - y
+    own[..., 2], own[..., 3] = velocity_x, velocity_y
+    own[..., 4], own[..., 5] = np.cos(heading), np.sin(heading)
+    own[..., 6], own[..., 7] = heading - world.start_headings, spin
     # A caller who ignores `truncated` goes past the limit.
-    parts[at["time"].start] = np.minimum(world.time, layout.time_limit)[:, None]
+    own[..., 8] = np.minimum(world.time, layout.time_limit)[:, None]
+    near, radius = world.near, world.settings.sensing_radius
     if agents > 1:
-        places = _places_of_others(worlds, agents)
-        seen = tuple(
-            part.reshape(-1).take(places) - part for part in (x, y, velocity_x, velocity_y)
-        )
-        sight = world.settings.sensing_radius**2
-        _fill(parts[at["neighbours"]], parts[at["neighbour_mask"]], seen, sight)
+        pairs = near.agents
+        seen = np.flatnonzero(pairs.square <= radius**2)
+        one, other = pairs.one[seen], pairs.other[seen]
+        course = world.parts[3:5].reshape(2, -1)
+        values = np.empty((2, len(seen), NEIGHBOUR_DIM), np.float32)
+        values[0, :, 0], values[0, :, 1] = pairs.x[seen], pairs.y[seen]
+        values[0, :, 2:] = (course[:, other] - course[:, one]).T
+        # Each sees the other, the opposite way.
+        np.negative(values[0], out=values[1])
+        whose, whom = np.concatenate([one, other]), np.concatenate([other, one])
+        which = whom % agents if worlds > 1 else whom.copy()
+        which -= whom > whose
+        slots = _Slots(at["neighbours"], at["neighbour_mask"], agents - 1)
+        distances = np.concatenate([pairs.square[seen]] * 2)
+        slots.fill(rows, whose, which, values.reshape(-1, NEIGHBOUR_DIM), distances)
     if world.obstacles:
-        across, up = world.centres_by_agent[0] - x, world.centres_by_agent[1] - y
-        seen = across, up, world.radii_by_agent
-        _fill(parts[at["obstacles"]], parts[at["obstacle_mask"]], seen, world.sight_by_agent)
-    return np.array(columns.T, order="C").reshape(worlds, agents, -1)
+        pairs, radii = near.obstacles, world.obstacle_radii.reshape(-1)
+        # -inf where there is no obstacle: its square must not count.
+        reach = np.maximum(radii + radius, -1.0)
+        seen = np.flatnonzero(pairs.square <= (reach * np.abs(reach)).take(pairs.other))
+        whose, disc = pairs.one[seen], pairs.other[seen]
+        discs = np.empty((len(seen), OBSTACLE_DIM), np.float32)
+        discs[:, 0], discs[:, 1], discs[:, 2] = pairs.x[seen], pairs.y[seen], radii[disc]
+        slots = _Slots(at["obstacles"], at["obstacle_mask"], world.obstacles)
+        rims = np.sqrt(pairs.square[seen]) - radii[disc]
+        slots.fill(rows, whose, disc % world.obstacles, discs, rims)
+    return rows.reshape(worlds, agents, -1)
 
 
-def _fill(
-    slots: Float32Array,
-    mask: Float32Array,
-    seen: tuple[FloatArray, ...],
-    sight: float | FloatArray,
-) -> None:
-    """Write what is sensed, shapes (slots, worlds, agents), to its entries; zero what is not.
+class _Slots(NamedTuple):
+    """The slots of one kind in an observation, and their mask.
 
-    Args:
-        slots: The entries of the slots, one after the other.
-        mask: The entries of their masks.
-        seen: What may be sensed; the first two are its offset.
-        sight: Square of the distance up to which it is.
+    Attributes:
+        slots: Where the slots are.
+        mask: Where their mask is, as long as there are slots.
+        most: How many bodies of that kind one agent might sense in a world.
     """
-    across, up = seen[:2]
-    mask[:] = across * across + up * up <= sight
-    for index, values in enumerate(seen):
-        np.multiply(values.astype(np.float32), mask, out=slots[index :: len(seen)])
+
+    slots: slice
+    mask: slice
+    most: int
+
+    def fill(
+        self,
+        rows: Float32Array,
+        whose: IntArray,
+        which: IntArray,
+        values: Float32Array,
+        distances: FloatArray,
+    ) -> None:
+        """Write what is sensed.
+
+        Each body has the slot of its number where there are as many slots. Else those that are
+        sensed lie side by side in the order of their numbers, and should more be sensed than there
+        are slots, which bodies that keep clear of each other cannot do, the nearest.
+
+        Args:
+            rows: The observations, shape (rows, size), in which nothing is sensed yet.
+            whose: The row that senses, shape (p,).
+            which: The number of what it senses among those of its world, shape (p,).
+            values: What is to be seen of it, shape (p, numbers).
+            distances: In whose order they are nearest, shape (p,).
+        """
+        count, size = rows.shape
+        room = self.mask.stop - self.mask.start
+        if room < self.most:
+            order = np.argsort(whose * self.most + which)
+            place = _places_among(whose[order], count)
+            if place.size and place.max() >= room:
+                order = np.lexsort((distances, whose))
+                order = order[_places_among(whose[order], count) < room]
+                order = order[np.argsort(whose[order] * self.most + which[order])]
+                place = _places_among(whose[order], count)
+            whose, which, values = whose[order], place, values[order]
+        flat, begin, dim = rows.reshape(-1), whose * size, values.shape[1]
+        flat[begin + (self.mask.start + which)] = 1.0
+        begin += self.slots.start + dim * which
+        flat[begin[:, None] + np.arange(dim)] = values
 
 
-@lru_cache(maxsize=8)
-def _places_of_others(worlds: int, agents: int) -> IntArray:
-    """Return where in (worlds * agents,) the others of each agent are, (others, worlds, agents)."""
-    own = np.arange(agents)
-    index = np.arange(agents - 1)[:, None]
-    others = np.asarray(index + (index >= own), np.intp)
-    return agents * np.arange(worlds)[:, None] + others[:, None]
+def _places_among(whose: IntArray, rows: int) -> IntArray:
+    """Return of ascending rows (p,) how many of the same came before."""
+    counts = np.bincount(whose, minlength=rows)
+    begins: IntArray = np.cumsum(counts) - counts
+    return np.arange(len(whose)) - begins[whose]
 
 
 def named_state_space(agents: int, obstacles: int, time_limit: float) -> spaces.Dict:

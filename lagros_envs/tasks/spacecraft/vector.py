@@ -20,7 +20,6 @@ from lagros_envs.tasks.spacecraft.scenarios import Preset, Scenario
 from lagros_envs.tasks.spacecraft.sensing import (
     global_state,
     named_state_space,
-    observation_columns,
     observe,
 )
 
@@ -91,7 +90,6 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         )
         self.world, self.layout = self.episode.world, self.episode.layout
         self.compiled = self.world.compiled
-        self._columns = observation_columns(self.world, self.layout)
         self.settings, self.preset = self.episode.settings, self.episode.preset
         self.named_space = self.layout.named_space
         self.named_state_space = named_state_space(
@@ -200,7 +198,7 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         self.world.begin(worlds, chosen, (episode_streams(seed).disturbance for seed in seeds))
 
     def _observation(self) -> Float32Array:
-        return observe(self.world, self.layout, self._columns).reshape(self.num_envs, -1)
+        return observe(self.world, self.layout).reshape(self.num_envs, -1)
 
     def _info(self) -> dict[str, Any]:
         return {

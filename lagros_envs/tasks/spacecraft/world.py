@@ -12,6 +12,7 @@ from lagros_envs.disturbances import Disturbance, Situation
 from lagros_envs.dynamics.held import HeldBatch
 from lagros_envs.sweep import Path, swept_agents, swept_obstacles
 from lagros_envs.tasks.spacecraft import task
+from lagros_envs.tasks.spacecraft.nearby import Near, Nearby
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 
 # With 2 substeps of 0.05 s, halving the substep moves no state of a 45 s episode by 1e-4 while
@@ -82,16 +83,11 @@ class SpacecraftWorld:
         self.obstacle_centres = np.zeros((2, worlds, obstacles))
         # An absent obstacle has the radius -inf, so that nothing touches or senses it.
         self.obstacle_radii = np.full((worlds, obstacles), -np.inf)
-        # The same for every agent, obstacles first: operations on them run over all rows at once.
-        self.centres_by_agent = np.zeros((2, obstacles, *shape))
-        # Zero where there is none.
-        self.radii_by_agent = np.zeros((obstacles, *shape))
-        # Distance of centres at which an agent touches, and its square within which it senses;
-        # negative where there is no obstacle.
-        self.contact_by_agent = np.full((obstacles, *shape), -np.inf)
-        self.sight_by_agent = np.full((obstacles, *shape), -1.0)
         self.agent_radius = np.zeros(worlds)
         self.core_radius = np.zeros(worlds)
+        # Found where it is asked for first, after worlds have begun.
+        self._nearby: Nearby | None = None
+        self._near: Near | None = None
         self.scenarios: list[Scenario | None] = [None] * worlds
         self.nominal: FloatArray | None = None
         self.step_count = np.zeros(worlds, dtype=np.intp)
@@ -189,8 +185,11 @@ class SpacecraftWorld:
         self.forces = control
         self.effort += effort
         self.step_count = self.step_count + 1
-        hit = swept_agents(path, 2.0 * self.agent_radius)
-        hit |= swept_obstacles(path, self.centres_by_agent, self.contact_by_agent)
+        near = self._look(float(path.reach.max()))
+        hit = swept_agents(path, 2.0 * self.agent_radius, near.agents)
+        if self.obstacles:
+            contact = self.obstacle_radii + self.core_radius[:, None]
+            hit |= swept_obstacles(path, self.obstacle_centres, contact, near.obstacles)
         hit |= ~integrated
         first_collision = hit & ~self.collided
         # The end of the step at the latest.
@@ -205,6 +204,14 @@ class SpacecraftWorld:
             np.repeat(over[:, None], self.agents, axis=1),
             np.repeat(late[:, None], self.agents, axis=1),
         )
+
+    @property
+    def near(self) -> Near:
+        """What may be sensed: who is near whom, and near which obstacle."""
+        near = self._near
+        if near is None or not np.array_equal(near.points, self.parts[:2]):
+            near = self._look(0.0)
+        return near
 
     def info(self) -> dict[str, Any]:
         """Return the measures of every agent, each of shape (worlds, agents) or with axes behind.
@@ -272,16 +279,25 @@ class SpacecraftWorld:
             count = len(one.obstacles)
             centres[:, place, :count] = one.obstacles.T
             radii[place, :count] = one.obstacle_radii
-        core = np.array([one.core for one in scenarios])
         self.obstacle_centres[:, worlds], self.obstacle_radii[worlds] = centres, radii
         self.agent_radius[worlds] = [one.agent_radius for one in scenarios]
-        self.core_radius[worlds] = core
-        # -inf where there is no obstacle: its reach must not count.
-        reach = np.maximum(radii + self.settings.sensing_radius, -1.0)
-        self.centres_by_agent[:, :, worlds] = np.moveaxis(centres, 1, -1)[..., None]
-        self.radii_by_agent[:, worlds] = np.where(np.isfinite(radii), radii, 0.0).T[..., None]
-        self.contact_by_agent[:, worlds] = (radii + core[:, None]).T[..., None]
-        self.sight_by_agent[:, worlds] = (reach * np.abs(reach)).T[..., None]
+        self.core_radius[worlds] = [one.core for one in scenarios]
+        self._nearby = self._near = None
+
+    def _look(self, reach: float) -> Near:
+        """Return what is near agents that came from no further than the reach [m], and keep it."""
+        if self._nearby is None:
+            self._nearby = Nearby(
+                self.settings.sensing_radius,
+                self.parts[:2],
+                self.goals,
+                2.0 * self.agent_radius,
+                self.obstacle_centres,
+                self.obstacle_radii,
+                self.core_radius,
+            )
+        self._near = self._nearby.at(self.parts[:2].copy(), reach)
+        return self._near
 
     def _current_push(self) -> FloatArray:
         """Return d of this step, (6, worlds, agents)."""

@@ -134,7 +134,8 @@ class ActionFilter(BasePolicy):
         if self.observes == "local":
             sensed = Sensed.of(self.layout, rows)
         else:
-            world = WorldState.of(self.preset.agents, self.layout.obstacles, rows)
+            slots = max(1, self.preset.obstacle_count[1])
+            world = WorldState.of(self.preset.agents, slots, rows)
             sensed = world.sensed(self.settings.sensing_radius)
         inner, counts, memory = self._remembered(state, len(rows), episode_start)
         wanted, inner = self.policy.predict(observation, inner, episode_start, deterministic)

@@ -73,9 +73,6 @@ class SafetyFilter(ActionFilter):
             # Two thrusters push along an axis; half of that is kept for the rest.
             most = limit / self.settings.system.mass
             chosen = replace(chosen, braking=min(chosen.braking, most))
-        self._softness = np.repeat(
-            [1.0, _OBSTACLE_SOFTNESS, 0.0], [self.layout.neighbours, self.layout.obstacles, 4]
-        )
         self.barrier = BrakingBarrier(
             chosen,
             self.preset.agent_radius,
@@ -117,12 +114,13 @@ class SafetyFilter(ActionFilter):
             target = wanted + self._sidestep(rows, np.argmax(lack[rows], axis=1), planes, sensed)
         torque, most = self._authority(wrench)
         axes = _body_axes(middle)
+        slots = sensed.neighbour_mask.shape[1], sensed.obstacle_mask.shape[1]
         normals = np.stack([planes.x[rows], planes.y[rows]], axis=-1)
         answer = nearest(
             target,
             np.concatenate([normals, axes, -axes], axis=1),
             np.concatenate([planes.bounds[rows], -most, -most], axis=1),
-            self._softness,
+            np.repeat([1.0, _OBSTACLE_SOFTNESS, 0.0], [*slots, 4]),
         )
         force = to_body(body.mass * answer.points, middle)
         thrust = allocate(body, np.concatenate([force, torque[:, None]], axis=1))
