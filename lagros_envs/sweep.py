@@ -54,6 +54,8 @@ def swept_agents(path: Path, contact: FloatArray, near: Offsets | None = None) -
     # as for the fastest and widest.
     most = 2.0 * float(reach.max()) + float(contact.max())
     met = np.flatnonzero(near.square <= most * most)
+    if not met.size:
+        return hit.reshape(worlds, agents)
     one, other = near.one[met], near.other[met]
     touch, reaches, curves = np.repeat(contact, agents), reach.reshape(-1), bulge.reshape(-1)
     limit = reaches[one] + reaches[other] + touch[one]
@@ -94,6 +96,8 @@ def swept_obstacles(
     # An absent obstacle has the contact -inf; its square must not count.
     most = max(0.0, float(reach.max()) + float(touch.max()))
     met = np.flatnonzero(near.square <= most * most)
+    if not met.size:
+        return hit.reshape(worlds, agents)
     agent, disc = near.one[met], near.other[met]
     limit = np.maximum(touch[disc] + reach.reshape(-1)[agent], 0.0)
     kept = near.square[met] <= limit * limit

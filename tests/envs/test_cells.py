@@ -118,9 +118,7 @@ def test_collisions_by_cells_are_those_by_all_pairs(seed):
 
 def flown(monkeypatch, by_cells, preset, worlds, agents, steps=12):
     """Everything that worlds show of themselves, by cells or by all pairs."""
-    most = 0 if by_cells else 10**9
-    monkeypatch.setattr(nearby, "AGENTS_BY_CELLS", most)
-    monkeypatch.setattr(nearby, "OBSTACLES_BY_CELLS", most)
+    monkeypatch.setattr(nearby, "MOST_PAIRS", 0 if by_cells else 10**9)
     env = SpacecraftVectorEnv(
         worlds * agents, agents, preset, "uniform", 1.0, compiled=False, max_episode_steps=10
     )

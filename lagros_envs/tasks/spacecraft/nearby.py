@@ -9,9 +9,9 @@ import numpy as np
 from lagros_envs.arrays import FloatArray
 from lagros_envs.cells import Cells, Offsets, Resting, all_beside, all_pairs
 
-# With fewer of them in a world all pairs are faster (`benchmarks/speed/swarm.py --thresholds`).
-AGENTS_BY_CELLS = 24
-OBSTACLES_BY_CELLS = 12
+# With fewer pairs in all worlds together it is faster to look at all of them: up to 126 agents in
+# one world, 16 in each of 64 (`benchmarks/speed/spacecraft_world.py --thresholds`).
+MOST_PAIRS = 8_000
 # What is looked for is a little further away than what is sensed and what can have met.
 _ROUNDING = 1.0 + 1e-12
 
@@ -68,9 +68,10 @@ class Nearby:
         # An absent obstacle lies at the origin and widens the rectangle at most.
         ends = np.concatenate([starts, goals, centres], axis=-1)
         low, high = ends.min(axis=-1).T, ends.max(axis=-1).T
-        if by_cells or (by_cells is None and self._agents >= AGENTS_BY_CELLS):
+        pairs = self._worlds * self._agents * (self._agents - 1) // 2
+        if by_cells or (by_cells is None and pairs > MOST_PAIRS):
             self._cells = Cells(low, high, max(sensing, 2.0 * self._contact))
-        many = by_cells or (by_cells is None and radii.shape[1] >= OBSTACLES_BY_CELLS)
+        many = self._agents * radii.size > MOST_PAIRS if by_cells is None else by_cells
         if many and present.any():
             reach = max(sensing + largest, 2.0 * self._touch)
             self._resting = Resting(low, high, centres, present, reach)
