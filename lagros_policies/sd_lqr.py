@@ -14,6 +14,9 @@ from lagros_policies.expert import TrackedPlans
 from lagros_policies.room import task_of
 from lagros_policies.tube_mpc import TubeMpcPolicy, TubeMpcState
 
+# Of the doubling: rounds at most, and the relative change at which the cost has settled.
+_ROUNDS, _SETTLED = 40, 1e-13
+
 
 class StateDependentRegulator:
     """u = u_d - K e, with K of a Riccati equation at (x, x_d, u_d) for the control that is held.
@@ -65,15 +68,7 @@ class StateDependentRegulator:
         self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
     ) -> tuple[FloatArray, BoolArray]:
         """Return K, shape (s, m, n), zero where there is none, and where that is, shape (s,)."""
-        transition, effect = self.held(state, nominal, nominal_control)
-        gains = np.zeros((*effect.shape[:-2], effect.shape[-1], effect.shape[-2]))
-        failed = np.zeros(len(gains), bool)
-        for row, matrices in enumerate(zip(transition, effect, strict=True)):
-            gain = _gain(*matrices, *self._costs)
-            failed[row] = gain is None
-            if gain is not None:
-                gains[row] = gain
-        return gains, failed
+        return held_gains(*self.held(state, nominal, nominal_control), *self._costs)
 
     def held(
         self, state: FloatArray, nominal: FloatArray, nominal_control: FloatArray
@@ -91,18 +86,54 @@ class StateDependentRegulator:
         return moved[:, :n, :n], moved[:, :n, n:]
 
 
-def _gain(
-    transition: FloatArray, effect: FloatArray, state: FloatArray, control: FloatArray
-) -> FloatArray | None:
-    from scipy.linalg import solve_discrete_are
+def held_gains(
+    transition: FloatArray, effect: FloatArray, state_cost: FloatArray, control_cost: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return the gains that minimise the infinite sum of e'Qe + v'Rv, of many loops at once.
 
+    By doubling (Anderson 1978; Chu, Fan, Lin & Wang 2004): after k rounds H is the cost of 2^k
+    holds, so that it settles in a dozen, and never where no gain exists.
+
+    Args:
+        transition: F, shape (s, n, n), of e+ = F e + G v.
+        effect: G, shape (s, n, m).
+        state_cost: Q, shape (n, n).
+        control_cost: R, shape (m, m).
+
+    Returns:
+        K of v = -K e, shape (s, m, n), zero where there is none, and where that is, shape (s,).
+    """
+    turned = effect.swapaxes(-1, -2)
+    with np.errstate(all="ignore"):  # what has no gain grows beyond all numbers
+        moved, reach = transition, effect @ np.linalg.solve(control_cost, turned)
+        cost = np.broadcast_to(state_cost, transition.shape)
+        for _ in range(_ROUNDS):
+            inner = np.eye(transition.shape[-1]) + reach @ cost
+            # At once W^-1 A and W^-1 G, of which everything else is made.
+            both = _solved(inner, np.concatenate([moved, reach], axis=-1))
+            ahead, behind = np.split(both, 2, axis=-1)
+            back = moved.swapaxes(-1, -2)
+            more = back @ cost @ ahead
+            reach = reach + moved @ behind @ back
+            moved, cost = moved @ ahead, cost + more
+            change = np.abs(more).max(axis=(-2, -1)) / np.abs(cost).max(axis=(-2, -1))
+            if not np.any(change > _SETTLED):
+                break
+        paid = turned @ cost
+        gains = _solved(control_cost + paid @ effect, paid @ transition)
+    failed = ~(change <= _SETTLED) | ~np.isfinite(gains).all(axis=(-2, -1))
+    return np.where(failed[:, None, None], 0.0, gains), failed
+
+
+def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve linear equations, one for each row; nan where one is singular to the last digit."""
     try:
-        cost = solve_discrete_are(transition, effect, state, control)
-        ahead = effect.T @ cost
-        gain: FloatArray = np.linalg.solve(control + ahead @ effect, ahead @ transition)
-    except (np.linalg.LinAlgError, ValueError):  # none exists, or a number is not finite
-        return None
-    return gain if np.isfinite(gain).all() else None
+        return np.asarray(np.linalg.solve(matrix, right))
+    except np.linalg.LinAlgError:
+        if len(matrix) == 1:
+            return np.full(right.shape, np.nan)
+        rows = zip(np.split(matrix, len(matrix)), np.split(right, len(right)), strict=True)
+        return np.concatenate([_solved(*row) for row in rows])
 
 
 class SdLqrPolicy(TubeMpcPolicy):

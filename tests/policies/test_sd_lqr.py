@@ -12,7 +12,7 @@ from lagros_envs.registry import task_named
 from lagros_envs.task import Feedback
 from lagros_envs.tasks import SHIPPED
 from lagros_policies import make
-from lagros_policies.sd_lqr import SdLqrPolicy, StateDependentRegulator
+from lagros_policies.sd_lqr import SdLqrPolicy, StateDependentRegulator, held_gains
 
 SINGLE = [name for name in SHIPPED if task_named(name).most_agents == 1]
 each = pytest.mark.parametrize("name", SINGLE)
@@ -83,36 +83,55 @@ def test_where_there_is_no_gain_the_target_has_one_and_it_is_counted(monkeypatch
     task = task_named("cartpole")
     law = StateDependentRegulator(task)
     state, nominal, control = drawn(task, 4)
-    solve = scipy.linalg.solve_discrete_are
     at_target, _ = law.gains(nominal[:1], nominal[:1], control[:1])
-    calls = []
+    held = StateDependentRegulator.held
 
-    def fails_once(*matrices):
-        calls.append(1)
-        if len(calls) == 1:
-            raise np.linalg.LinAlgError("none")
-        return solve(*matrices)
+    def lost(self, at, *others):
+        """Let no control reach anything where the state is that of the test."""
+        transition, effect = held(self, at, *others)
+        reached = (at != state[:1]).any(axis=-1)[:, None, None]
+        return transition, np.where(reached, effect, 0.0)
 
-    monkeypatch.setattr(scipy.linalg, "solve_discrete_are", fails_once)
+    monkeypatch.setattr(StateDependentRegulator, "held", lost)
     found, failed = law.answer(state[:1], nominal[:1], control[:1])
     assert failed.tolist() == [True]
     np.testing.assert_allclose(
         found[0], control[0] - at_target[0] @ (state[0] - nominal[0]), rtol=1e-6
     )
 
-    def fails(*matrices):
-        raise np.linalg.LinAlgError("none")
+    def unmoved(self, *at):
+        transition, effect = held(self, *at)
+        return transition, 0.0 * effect
 
     env = TaskEnv(task=task, disturbance="none")
     policy = SdLqrPolicy(task, deadline=1e9)
     row, _ = env.reset(seed=3)
-    monkeypatch.setattr(scipy.linalg, "solve_discrete_are", fails)
+    monkeypatch.setattr(StateDependentRegulator, "held", unmoved)
     memory = None
     for _ in range(5):
         action, memory = policy.predict(row, memory)
         row, *_ = env.step(action)
     assert policy.counters(memory)["fallbacks"] == 5
     np.testing.assert_allclose(task.control(action), memory[0].plan.controls[4], rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_gains_of_many_loops_are_those_of_scipy_and_one_without_spoils_no_other(seed):
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.integers(1, 7)), int(rng.integers(1, 4))
+    transition = rng.normal(size=(12, n, n)) * rng.choice((0.3, 1.0, 3.0), (12, 1, 1))
+    effect = rng.normal(size=(12, n, m))
+    state, control = np.diag(rng.uniform(0.1, 10.0, n)), np.diag(rng.uniform(0.01, 10.0, m))
+    # One that grows, one that stays and one that is no number, none of them reached.
+    for row, diagonal in enumerate((1.5, 1.0, np.nan)):
+        transition[row], effect[row] = diagonal * np.eye(n), 0.0
+    gains, failed = held_gains(transition, effect, state, control)
+    assert failed.tolist() == [True] * 3 + [False] * 9
+    assert not gains[:3].any()
+    for f, g, gain in zip(transition[3:], effect[3:], gains[3:], strict=True):
+        cost = scipy.linalg.solve_discrete_are(f, g, state, control)
+        wanted = np.linalg.solve(control + g.T @ cost @ g, g.T @ cost @ f)
+        np.testing.assert_allclose(gain, wanted, rtol=1e-6, atol=1e-7 * np.abs(wanted).max())
 
 
 def test_the_weights_decide():
