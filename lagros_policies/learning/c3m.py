@@ -96,22 +96,23 @@ class C3mSettings:
             raise ValueError(f"largest={self.largest!r} must be above least={self.least!r}")
 
 
-def region_of(task: Task, seed: int = 0) -> BoxRegion:
+def region_of(task: Task, seed: int = 0, met: bool = False) -> BoxRegion:
     """Return where the networks of a task are to work: x_d, u_d and x - x_d, each in a box.
 
-    That of the metric that the task describes. Of a task without one, what random plans of the
-    training ask for, with a tenth more, and what a regulator along them leaves under random
-    disturbances up to the task's bound: the error that it exceeds once in a hundred steps.
+    That of the metric that the task describes. Of a task without one, or if `met`, what random
+    plans of the training ask for, with a tenth more, and what a regulator along them leaves under
+    random disturbances up to the task's bound: the error that it exceeds once in a hundred steps.
 
     Args:
         task: The task.
         seed: Of the plans.
+        met: Whether to ask plans although the task describes a metric.
 
     Raises:
         RuntimeError: There is no plan.
     """
     wanted = task.metric
-    if wanted is not None:
+    if wanted is not None and not met:
         return BoxRegion(
             wanted.low, wanted.high, wanted.error, wanted.control_low, wanted.control_high
         )

@@ -2,7 +2,9 @@
 
 import json
 import re
+from dataclasses import asdict, replace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("stable_baselines3")
@@ -11,30 +13,59 @@ from typer.testing import CliRunner
 
 from lagros_benchmarks.commands import train as command
 from lagros_benchmarks.commands.cli import app
+from lagros_benchmarks.run.files import plain
 from lagros_benchmarks.training import c3m
-from lagros_benchmarks.training.c3m_run import C3mRun
+from lagros_benchmarks.training.c3m_run import SCAN, C3mRun
 from lagros_benchmarks.training.run import Place
 from lagros_envs.registry import task_named
 from lagros_policies.c3m import ContractionNetworks
-from lagros_policies.learning.c3m import C3mSettings
+from lagros_policies.learning.c3m import C3mSettings, region_of
 
 TINY = C3mSettings(samples=64, epochs=2, batch=32, width=8, directions=8, checks=32)
 
 
 def test_a_complete_run_is_only_read_and_another_one_is_refused(tmp_path, monkeypatch):
     place = Place(tmp_path / "run")
-    run = C3mRun("pvtol", TINY, final_episodes=2)
+    run = C3mRun("segway", TINY, SCAN[:2], scan_episodes=3, final_episodes=2)
     record = c3m.train(run, place, "a command")
     assert record == json.loads(place.record.read_text())
     assert [row["disturbance"] for row in record["final"]] == ["uniform", "constant"]
     law = ContractionNetworks.load(place.weights)
     assert law.metadata["policy"] == "c3m"
-    assert law.scaled.seen == (2, 3, 4, 5)
+    assert law.scaled.seen == (1, 2, 3)
     assert not list(place.folder.glob("progress*"))
     monkeypatch.setattr(c3m, "fit_c3m", None)
     assert c3m.train(run, place) == record
     with pytest.raises(ValueError, match="holds another run"):
         c3m.train(run.seeded(1), place)
+
+
+def test_the_candidate_that_flies_best_is_kept(tmp_path, monkeypatch):
+    flown = iter(
+        [(0.5, 0.5, 1.0), (1.0, 0.5, 3.0), (1.0, 0.5, 2.0), (0.9, 0.9, 0.1), (0.0, 0.0, 9.0)]
+    )
+
+    def figures(task, networks, episodes, namespace):
+        names = ("success", "strict", "final_distance")
+        return [dict(zip(names, next(flown), strict=True))]
+
+    monkeypatch.setattr(c3m, "_flown", figures)
+    place = Place(tmp_path / "run")
+    record = c3m.train(C3mRun("segway", TINY), place)
+    assert [one["candidate"] for one in record["scan"]] == [asdict(one) for one in SCAN]
+    assert record["chosen"] == asdict(SCAN[2])
+    # The weights and the region are its own: the middle of the box is in the file.
+    law = ContractionNetworks.load(place.weights)
+    region = region_of(task_named("segway"), 0, met=True)
+    middle = np.mean([region.low, region.high], axis=0)
+    np.testing.assert_allclose(law.scaled.centre, middle, rtol=1e-6)
+    assert record["region"] == plain(asdict(region))
+
+
+def test_a_candidate_is_as_fast_as_episodes_are_long():
+    run = C3mRun("segway", TINY)
+    assert run.settings_of(SCAN[0], 6.0) == replace(TINY, rate=0.5, largest=10.0)
+    assert run.settings_of(SCAN[2], 600.0) == replace(TINY, rate=0.01, largest=100.0)
 
 
 def test_what_is_missing_is_trained_and_put_in_its_place(tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from dataclasses import asdict
-from typing import Any
+from typing import Any, NamedTuple
 
 from lagros_benchmarks.run.files import plain, write_json
 from lagros_benchmarks.run.surroundings import machine, versions
@@ -19,13 +19,15 @@ from lagros_envs.reading import Record
 from lagros_envs.registry import find_task
 from lagros_envs.seeding import episode_seeds
 from lagros_envs.task import Task
-from lagros_policies.c3m import C3mPolicy
+from lagros_policies.c3m import C3mPolicy, ContractionNetworks
 from lagros_policies.learning.c3m import fit_c3m, region_of
 from lagros_policies.trained_for import training_of, weights_record
 
 _LOG = logging.getLogger(__name__)
-_CHECKPOINT = "progress.safetensors"
+_CHECKPOINT = "progress-{}.safetensors"
 _KINDS = "uniform", "constant"
+# Namespace of the episodes that choose among the candidates ("scan" in ASCII).
+_SCANNED = 0x7363616E
 
 
 def train(run: C3mRun, place: Place, command: str = "", tell: Progress = untold) -> dict[str, Any]:
@@ -35,7 +37,7 @@ def train(run: C3mRun, place: Place, command: str = "", tell: Progress = untold)
         run: The run.
         place: Where it is kept.
         command: What prints the run again, for its record.
-        tell: Called with the epochs done and their number.
+        tell: Called with the epochs done and their number, of all candidates.
 
     Returns:
         The record, as it is written.
@@ -50,25 +52,25 @@ def train(run: C3mRun, place: Place, command: str = "", tell: Progress = untold)
         if place.weights.exists() and digest_of(place.weights) == found.entries["weights_sha256"]:
             return dict(found.entries)
     task: Any = find_task(run.task)
-    region = region_of(task, run.seed)
     place.folder.mkdir(parents=True, exist_ok=True)
-    begun, checkpoint = time.process_time(), place.folder / _CHECKPOINT
-
-    def told(epoch: int, loss: float) -> None:
-        _LOG.info("%s %d/%d: loss %.4g", place.folder, epoch, run.settings.epochs, loss)
-        tell(run.label, epoch, run.settings.epochs)
-
-    networks, observed = fit_c3m(task, region, run.settings, checkpoint, told)
+    begun = time.process_time()
+    tried = [
+        _tried(run, task, place, number, tell)
+        for number, candidate in enumerate(run.scan)
+        if candidate.met or task.metric is not None
+    ]
+    best = max(tried, key=_merit)
     spent = time.process_time() - begun
-    trained_for = training_of(task).range(timed=False)
-    networks.frozen_copy(weights_record(task.name, run.label, trained_for)).save(place.weights)
+    best.networks.save(place.weights)
     record = plain(
         {
             "command": command,
             "training": run.record(),
-            "region": asdict(region),
-            "conditions": observed,
-            "final": _final(task, place, run.final_episodes),
+            "scan": [one.said for one in tried],
+            "chosen": best.said["candidate"],
+            "region": best.region,
+            "conditions": best.said["conditions"],
+            "final": _flown(task, best.networks, run.final_episodes, FINAL),
             "cpu_seconds": round(spent, 1),
             "machine": machine(),
             "versions": versions(),
@@ -76,13 +78,51 @@ def train(run: C3mRun, place: Place, command: str = "", tell: Progress = untold)
         }
     )
     write_json(place.record, record)
-    checkpoint.unlink(missing_ok=True)
+    for path in place.folder.glob(_CHECKPOINT.format("*")):
+        path.unlink()
     finished: dict[str, Any] = record
     return finished
 
 
-def _final(task: Task, place: Place, episodes: int) -> list[dict[str, Any]]:
+class _Tried(NamedTuple):
+    """A candidate after its training: what flies, where it was trained, and what came of it."""
+
+    networks: ContractionNetworks
+    region: dict[str, Any]
+    said: dict[str, Any]
+
+
+def _tried(run: C3mRun, task: Task, place: Place, number: int, tell: Progress) -> _Tried:
+    candidate = run.scan[number]
+    settings = run.settings_of(candidate, task.time_limit)
+    region = region_of(task, run.seed, candidate.met)
+
+    def told(epoch: int, loss: float) -> None:
+        _LOG.info("%s #%d %d/%d: loss %.4g", place.folder, number, epoch, settings.epochs, loss)
+        tell(run.label, number * settings.epochs + epoch, len(run.scan) * settings.epochs)
+
+    checkpoint = place.folder / _CHECKPOINT.format(number)
+    made, observed = fit_c3m(task, region, settings, checkpoint, told)
+    trained_for = training_of(task).range(timed=False)
+    networks = made.frozen_copy(weights_record(task.name, run.label, trained_for))
+    figures = _flown(task, networks, run.scan_episodes, _SCANNED)
+    said = {"candidate": asdict(candidate), "conditions": observed, "figures": figures}
+    return _Tried(networks, asdict(region), said)
+
+
+def _merit(one: _Tried) -> tuple[float, float, float]:
+    """Return by what a candidate is judged, the largest first: success, strict, distance left."""
+    rows = one.said["figures"]
+    success, strict, left = (
+        sum(row[name] for row in rows) for name in ("success", "strict", "final_distance")
+    )
+    return success, strict, -left
+
+
+def _flown(
+    task: Task, networks: ContractionNetworks, episodes: int, namespace: int
+) -> list[dict[str, Any]]:
     """Return the figures under disturbances of the task's bound."""
-    policy = C3mPolicy(task, place.weights, deadline=math.inf)
-    seeds = episode_seeds(0, episodes, FINAL)
+    policy = C3mPolicy(task, networks, deadline=math.inf)
+    seeds = episode_seeds(0, episodes, namespace)
     return [final_row(policy, seeds, kind, task.defaults.bound) for kind in _KINDS]
