@@ -124,8 +124,8 @@ def region_of(task: Task, seed: int = 0, met: bool = False) -> BoxRegion:
     made = plan_arrays(task, held)
     tracked = expert.track(made["plan_states"], made["plan_controls"])
     data = ExpertDataSettings(disturbance_bound=task.defaults.bound)
-    met, plan, step = tube_states(np.random.default_rng([seed, 2]), expert, tracked, data)
-    error = np.quantile(np.abs(met - tracked.states[plan, step]), 0.99, axis=0)
+    reached, plan, step = tube_states(np.random.default_rng([seed, 2]), expert, tracked, data)
+    error = np.quantile(np.abs(reached - tracked.states[plan, step]), 0.99, axis=0)
     return BoxRegion(
         *_ends(tracked.states), tuple((error + _LEAST).tolist()), *_ends(tracked.controls)
     )

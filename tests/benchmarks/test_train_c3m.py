@@ -51,7 +51,7 @@ def test_the_candidate_that_flies_best_is_kept(tmp_path, monkeypatch):
 
     monkeypatch.setattr(c3m, "_flown", figures)
     place = Place(tmp_path / "run")
-    record = c3m.train(C3mRun("segway", TINY), place)
+    record = c3m.train(C3mRun("segway", TINY, enough=1.0), place)
     assert [one["candidate"] for one in record["scan"]] == [asdict(one) for one in SCAN]
     assert record["chosen"] == asdict(SCAN[2])
     # The weights and the region are its own: the middle of the box is in the file.
@@ -62,9 +62,17 @@ def test_the_candidate_that_flies_best_is_kept(tmp_path, monkeypatch):
     assert record["region"] == plain(asdict(region))
 
 
+def test_no_other_is_tried_where_the_first_keeps_its_promise(tmp_path):
+    run = C3mRun("segway", TINY, enough=0.0, scan_episodes=1, final_episodes=1)
+    record = c3m.train(run, Place(tmp_path / "run"))
+    assert len(record["scan"]) == 1
+    assert record["chosen"] == asdict(SCAN[0])
+
+
 def test_a_candidate_is_as_fast_as_episodes_are_long():
     run = C3mRun("segway", TINY)
-    assert run.settings_of(SCAN[0], 6.0) == replace(TINY, rate=0.5, largest=10.0)
+    assert run.settings_of(SCAN[0], 600.0) == replace(TINY, largest=10.0)
+    assert run.settings_of(SCAN[1], 6.0) == replace(TINY, rate=0.5, largest=10.0)
     assert run.settings_of(SCAN[2], 600.0) == replace(TINY, rate=0.01, largest=100.0)
 
 

@@ -54,11 +54,9 @@ def train(run: C3mRun, place: Place, command: str = "", tell: Progress = untold)
     task: Any = find_task(run.task)
     place.folder.mkdir(parents=True, exist_ok=True)
     begun = time.process_time()
-    tried = [
-        _tried(run, task, place, number, tell)
-        for number, candidate in enumerate(run.scan)
-        if candidate.met or task.metric is not None
-    ]
+    tried = [_tried(run, task, place, 0, tell)]
+    if tried[0].said["conditions"]["closed"] < run.enough:
+        tried += [_tried(run, task, place, number, tell) for number in range(1, len(run.scan))]
     best = max(tried, key=_merit)
     spent = time.process_time() - begun
     best.networks.save(place.weights)

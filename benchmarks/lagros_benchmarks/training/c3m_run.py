@@ -15,27 +15,32 @@ class Candidate:
     Attributes:
         met: Whether x_d, u_d and x - x_d are drawn from what plans ask for and a regulator leaves,
             or from the box of the task's metric, which only tasks with one have.
-        pace: lambda times the length of an episode: 3 is the published 0.5 /s of 6 s.
+        pace: lambda times the length of an episode, where 3 is the published 0.5 /s of 6 s; None
+            for the rate of the run.
         largest: w_ub, in scaled coordinates.
     """
 
     met: bool
-    pace: float
+    pace: float | None
     largest: float
 
 
 # The first is as published. The same for every task.
-SCAN = (Candidate(False, 3.0, 10.0), Candidate(True, 3.0, 10.0), Candidate(True, 6.0, 100.0))
+SCAN = (Candidate(False, None, 10.0), Candidate(True, 3.0, 10.0), Candidate(True, 6.0, 100.0))
 
 
 @dataclass(frozen=True)
 class C3mRun:
-    """A run: every candidate is trained and flown, and the best is kept.
+    """A run: of the candidates that are trained and flown the best is kept.
+
+    The second and later ones are tried where the contraction that the first promises holds on less
+    than `enough` of fresh states.
 
     Attributes:
         task: Its name.
         settings: How it trains, but for what the candidates say.
         scan: The candidates.
+        enough: Share of fresh states; 1 to try all.
         scan_episodes: Episodes on which they are judged, under each of two kinds of disturbance.
         final_episodes: Held-out episodes at its end, likewise.
     """
@@ -43,6 +48,7 @@ class C3mRun:
     task: str
     settings: C3mSettings = field(default_factory=C3mSettings)
     scan: tuple[Candidate, ...] = SCAN
+    enough: float = 0.5
     scan_episodes: int = 20
     final_episodes: int = 50
 
@@ -59,7 +65,7 @@ class C3mRun:
 
     def settings_of(self, candidate: Candidate, time_limit: float) -> C3mSettings:
         """Return the settings of a candidate on a task whose episodes are that long [s]."""
-        rate = candidate.pace / time_limit
+        rate = self.settings.rate if candidate.pace is None else candidate.pace / time_limit
         return replace(self.settings, rate=rate, largest=candidate.largest)
 
     def record(self) -> dict[str, Any]:
