@@ -37,7 +37,7 @@ def script(name: str) -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("name", ["spec", "notebooks"])
+@pytest.mark.parametrize("name", ["spec", "notebooks", "leaderboard"])
 def test_what_is_made_of_code_and_pages_is_as_they_are(name: str) -> None:
     assert script(name).main([]) is None
 

@@ -267,6 +267,13 @@ ROWS = {
         "--quiet": Row(FLAG),
     },
     "doctor": {"--json": Row(FLAG, ("",))},
+    "leaderboard": {
+        "--rerun": Row((*WHOLE, "201"), ("text",)),
+        "--trust": Row(("",), ("text --rerun 1",), ("text",), "mine:Mine"),
+        "--markdown": Row(WRITTEN, ("text",)),
+        "--quiet": Row(FLAG, ("text",)),
+        "files": Row(("absent.json", "folder", ""), ("",)),
+    },
 }
 
 

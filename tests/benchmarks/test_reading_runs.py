@@ -84,7 +84,7 @@ def grounded(monkeypatch):
     """The command `attack --replay` up to its flights, which do what the file says."""
 
     class Bench(SingleBench):
-        def prepare(self, say):
+        def prepare(self):
             assert isinstance(self.settings, AttackSettings)
 
         def replay(self, pushes):

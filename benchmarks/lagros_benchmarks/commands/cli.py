@@ -17,6 +17,7 @@ from lagros_benchmarks.commands.doctor import doctor
 from lagros_benchmarks.commands.export import export
 from lagros_benchmarks.commands.extras import check_extra
 from lagros_benchmarks.commands.first_steps import a_few_worlds, first_steps
+from lagros_benchmarks.commands.leaderboard import leaderboard
 from lagros_benchmarks.commands.new import new
 from lagros_benchmarks.commands.outputs import check_outputs, policy_files
 from lagros_benchmarks.commands.streams import printing_failed
@@ -334,6 +335,7 @@ app.command(cls=Command)(certify)
 app.command(cls=Command)(train)
 app.command(cls=Command)(attack)
 app.command(cls=Command)(suite)
+app.command(cls=Command)(leaderboard)
 app.command(cls=Command)(doctor)
 app.add_typer(data, name="data")
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from lagros_benchmarks.run.experiment import BenchmarkRun, Row
+from lagros_benchmarks.run.fingerprints import policy_digest, seeds_digest
 from lagros_benchmarks.run.room import room_of
 from lagros_benchmarks.run.settings import PROVED_FILTER, Case
 from lagros_benchmarks.run.surroundings import machine, own_command, threads, versions
@@ -39,6 +40,7 @@ def summarise(run: BenchmarkRun, command: Sequence[str] | None = None) -> list[R
             **own.figures(run, case),
             "raised": sum(one.error is not None for one in episodes),
             "errors": [{"seed": e.seed, "text": e.error} for e in episodes if e.error is not None],
+            "evidence": _evidence(run, case),
             **_compared(run, case, own.comparison),
             **surroundings,
         }
@@ -68,6 +70,28 @@ def _identity(run: BenchmarkRun, case: Case) -> Row:
         "safety_filter": case.safety_filter,
         **({"proved_filter": True} if settings.safety_filter == PROVED_FILTER else {}),
     }
+
+
+def _evidence(run: BenchmarkRun, case: Case) -> Row:
+    """Return by what somebody else can tell that the same was flown, and how each flight ended.
+
+    Outcomes are one figure per episode, or per agent of each world in turn: 2 for a strict success,
+    1 for a success, 0 for neither, "-" where nobody says what a success is.
+    """
+    settings = run.settings
+    flights = [one for record in run.episodes[case] for one in getattr(record, "agents", [record])]
+    return {
+        "seeds_sha256": seeds_digest(settings.episode_seeds()),
+        "policy_sha256": policy_digest(case.policy, settings.description),
+        "outcomes": "".join(map(_outcome, flights)),
+    }
+
+
+def _outcome(record: Any) -> str:
+    success = getattr(record, "success", None)
+    if success is None:
+        return "-"
+    return str(int(success) + int(success and getattr(record, "strict_success", False)))
 
 
 def _compared(run: BenchmarkRun, case: Case, compare: Callable[[Any, Any], Row]) -> Row:

@@ -8,6 +8,7 @@ import importlib.util
 import inspect
 import json
 import re
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
@@ -23,9 +24,9 @@ from lagros_benchmarks.run.surroundings import machine, threads, versions
 from lagros_envs.dynamics.straight_line import statements, straight_line
 from lagros_envs.foreign import Foreign
 from lagros_envs.numbers import functions
-from lagros_envs.task import Task
+from lagros_envs.task import Described, Task
 from lagros_policies.naming import is_file, model_file, user_class
-from lagros_policies.room import weights_folder
+from lagros_policies.room import shipped_file, weights_folder
 
 _PACKAGES = ("lagros_envs", "lagros_policies", "lagros_benchmarks")
 # Modules, weights and settings that a class of the user's own may read.
@@ -66,6 +67,31 @@ def fingerprint(settings: BenchmarkSettings, toolbox: Toolbox) -> str:
     }
     text = json.dumps(depends, sort_keys=True, default=repr)
     return hashlib.sha256(text.encode(errors="backslashreplace")).hexdigest()
+
+
+def seeds_digest(seeds: Iterable[int]) -> str:
+    """Return a hash of the seeds of episodes, in their order."""
+    return hashlib.sha256(",".join(map(str, seeds)).encode()).hexdigest()
+
+
+def policy_digest(name: str, task: Described) -> str | None:
+    """Return the SHA-256 of the file that a policy flies from: weights, a model, or its module.
+
+    Returns:
+        The hash; None for a policy without such a file.
+    """
+    from lagros_policies.policy import policy_names
+
+    model = model_file(name)
+    if name in policy_names(task):
+        path = shipped_file(task, f"{name.partition(':')[0]}.safetensors")
+    elif model is not None:
+        path = model.path
+    else:
+        # It has been imported where it has flown; nothing is imported here.
+        module = sys.modules.get(_module_named(name) or "")
+        path = Path(getattr(module, "__file__", None) or "")
+    return hashlib.sha256(path.read_bytes()).hexdigest() if is_file(path) else None
 
 
 def described(task: Task) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from lagros_policies.policy import policy_names
 _LEFT_OUT = {
     *("time_s", "paper_tube", "certified_tube", "counters", "step_time_while_contended"),
     *("mean_tracking_error", "tracking_error_p10", "tracking_error_p90", "bound_over_worst"),
-    *("machine", "versions", "threads", "command"),
+    *("machine", "versions", "threads", "command", "evidence"),
 }
 
 
