@@ -14,8 +14,9 @@ import json
 import math
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from lagros_envs.registry import find_task
 from lagros_envs.task import Task
@@ -218,23 +219,60 @@ def updated(text: str, block: str) -> str:
     return before + BEGIN + block + END + rest.partition(END)[2]
 
 
+def _blocks() -> Iterator[tuple[Path, str]]:
+    """Yield each page and what is to stand between its marks."""
+    tasks = {name: find_task(name) for name in SHIPPED}
+    # A preset of a task stands on the page of the task.
+    presets = {f"{name}-{preset}" for name, task in tasks.items() for preset in task.presets}
+    tasks = {name: task for name, task in tasks.items() if name not in presets}
+    for name, task in tasks.items():
+        if isinstance(task, Task | SpacecraftSettings):
+            yield PAGES / f"{name}.md", specification(task)
+    yield PAGES / "index.md", "\n".join(["", *_overview(tasks), ""]) + "\n"
+
+
+def _overview(tasks: Mapping[str, Any]) -> Iterator[str]:
+    yield "| environment | state, control | limit [s] | discs | d̄ | constant push: (b), (c) [%] |"
+    yield "|---|---:|---:|---:|---:|---:|"
+    for name, task in tasks.items():
+        page = (PAGES / f"{name}.md").read_text(encoding="utf-8")
+        title = page.partition("\n")[0].removeprefix("# ").partition(",")[0]
+        if isinstance(task, Task):
+            sizes = f"{task.system.state_dim}, {task.system.control_dim}"
+            bound = f"{task.defaults.bound or task.defaults.bounds[0]:g}"
+            facts = (sizes, f"{task.time_limit:g}", f"{task.most_discs or '–'}", bound)
+            yield f"| [{title}]({name}.md) | {' | '.join(facts)} | {_pushed(name)} |"
+        else:
+            yield f"| [{title}]({name}.md) | 6, 8 each | {task.time_limit:g} | obstacles | – | – |"
+
+
+def _pushed(name: str) -> str:
+    """Return the strict success of (b) and (c) under a constant push, as published."""
+    path = RESULTS / f"{name}.json"
+    grid = RESULTS / f"{name}_grid.json"
+    path = path if path.is_file() else grid
+    rows = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    most = max((row["bound"] for row in rows), default=0.0)
+    of = {
+        row["policy"]: 100 * row["strict_success_rate"]
+        for row in rows
+        if row["disturbance"] == "constant" and row["bound"] == most
+    }
+    found = [f"{of[policy]:.1f}" for policy in ("tube-mpc", "lagros") if policy in of]
+    return ", ".join(found) or "–"
+
+
 def main(arguments: Sequence[str] | None = None) -> str | None:
     """Compare or write the pages; return what is wrong."""
     parser = argparse.ArgumentParser(description="What the code says of each system.")
     parser.add_argument("--update", action="store_true", help="write the pages")
     update = parser.parse_args(arguments).update
     stale = []
-    tasks = {name: find_task(name) for name in SHIPPED}
-    # A preset of a task stands on the page of the task.
-    presets = {f"{name}-{preset}" for name, task in tasks.items() for preset in task.presets}
-    for name, task in tasks.items():
-        page = PAGES / f"{name}.md"
-        if name in presets or not isinstance(task, Task | SpacecraftSettings):
-            continue
+    for page, block in _blocks():
         text = page.read_text(encoding="utf-8")
-        wanted = updated(text, specification(task))
+        wanted = updated(text, block)
         if wanted != text:
-            stale.append(name)
+            stale.append(page.stem)
             if update:
                 page.write_text(wanted, encoding="utf-8")
     if stale and not update:
