@@ -7,6 +7,7 @@ by a test that is named here. `test_small.py` counts that none is left over.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -33,7 +34,7 @@ ELSEWHERE = {
     ),
     r"pytest tests/": "tests",
 }
-# What is put behind the words of a command; of an option that is given twice the last one counts.
+# What is put behind the words of a command, in place of what they say of the same option.
 _FEW = ("--episodes", "1", "--quiet")
 SMALL = {
     "attack": (*_FEW, "--budget", "20"),
@@ -92,7 +93,24 @@ def small(words: tuple[str, ...]) -> tuple[str, ...] | None:
         more = _FEW
     if program == "python":
         first = str(ROOT / first)
-    return (program, first, *rest, *more)
+    return (program, first, *given(rest, more))
+
+
+def given(words: Sequence[str], more: Sequence[str]) -> list[str]:
+    """Return words with further options; what they had of the same option is left out."""
+    valued = {
+        word: not after.startswith("--")
+        for word, after in zip(more, [*more[1:], "--"][: len(more)], strict=True)
+        if word.startswith("--")
+    }
+    kept: list[str] = []
+    following = iter(words)
+    for word in following:
+        if word not in valued:
+            kept.append(word)
+        elif valued[word]:
+            next(following, None)
+    return [*kept, *more]
 
 
 def smaller(block: str) -> str:

@@ -64,6 +64,20 @@ def test_a_command_that_nobody_runs_is_found() -> None:
     assert small.small(("python", "benchmarks/studies/conformal.py")) is None
     assert small.small(("lagros", "doctor")) is None
     assert small.runner("docs/speed.md", ("make", "speed")) == "tests/benchmarks/test_speed.py"
+    words = (
+        "lagros",
+        "bench",
+        "car",
+        "--episodes",
+        "200",
+        "--quiet",
+        "--bound",
+        "1",
+        "--jobs",
+        "2",
+    )
+    behind = ["--bound", "1", "--episodes", "1", "--quiet", "--jobs", "1"]
+    assert small.small(words) == ("lagros", "bench", "car", *behind)
     assert small.smaller("learn(350_000, episodes=20)") == "learn(64, episodes=1)"
 
 
