@@ -1,4 +1,4 @@
-"""C3M's cart-pole beside mechanics and beside ours: docs/systems/cartpole.md."""
+"""C3M's cart-pole beside mechanics and beside ours: benchmarks/studies/published.md."""
 
 import numpy as np
 
