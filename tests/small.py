@@ -28,6 +28,7 @@ ELSEWHERE = {
     r"make speed$|python benchmarks/speed/run.py": "tests/benchmarks/test_speed.py",
     r"python benchmarks/speed/tasks.py": "tests/benchmarks/test_speed.py",
     r"lagros .*--backend (ray|dask)": "tests/benchmarks/test_backends.py",
+    r"lagros leaderboard": "tests/benchmarks/test_leaderboard.py",
     r"lagros train \S+ --algo missing": "tests/benchmarks/test_train_c3m.py",
     r"python benchmarks/studies/reproduction_table.py": (
         "tests/benchmarks/test_reproduction_table.py"
@@ -43,7 +44,19 @@ SMALL = {
     "data": _FEW,
     "export": (),
     "reproduce": (*_FEW, "--shipped-weights", "--jobs", "1"),
-    "suite": (*_FEW, "--policies", "lqr,lqr-plan", "--worlds", "1", "--proved", "0", "--jobs", "1"),
+    "suite": (
+        *_FEW,
+        "--policies",
+        "lqr,lqr-plan",
+        "--worlds",
+        "1",
+        "--proved",
+        "0",
+        "--jobs",
+        "1",
+        "--fewer",
+        "mpc=1",
+    ),
     "train": ("--segments", "1", "--seed", "0", "--quiet"),
     "watch": ("--seconds", "0.5"),
     "python benchmarks/studies/plan_law.py": ("--episodes", "1"),
