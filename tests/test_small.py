@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests import documents, first_half, small
+from tests.test_documents import check_lagros
 
 ROOT = small.ROOT
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -54,7 +55,10 @@ def test_every_command_is_run_by_a_test_and_at_small_size_if_by_none_of_its_own(
             total += 1
             test = small.runner(name(page), command.words)
             if test is None:
-                assert small.small(command.words), (name(page), " ".join(command.words))
+                made = small.small(command.words)
+                assert made, (name(page), " ".join(command.words))
+                if made[0] == "lagros":
+                    check_lagros(made[1:])
             else:
                 assert (ROOT / test).exists(), test
     assert total > 80
@@ -97,8 +101,11 @@ def test_what_a_page_says_runs(page: Path, tmp_path: Path) -> None:
             text=True,
             check=False,
         )
-        # 3: a policy raised; 1 of `certify`: a line does not hold, which so few episodes may bring.
-        assert done.returncode == 0, (words, done.stdout[-2000:], done.stderr[-2000:])
+        # 1 of `certify`: something does not hold, which so little time may bring.
+        fine = {0, 1} if words[:2] == ("lagros", "certify") else {0}
+        said = (words, done.stdout[-2000:], done.stderr[-2000:])
+        assert done.returncode in fine, said
+        assert "Traceback" not in done.stderr, said
 
     # What a command names of the repository is there under the same name.
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
