@@ -35,6 +35,8 @@ YELLOW: Colour = (240, 228, 66)
 COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY_BLUE, YELLOW)
 BODY = 0.62  # half the side of the body, as a share of the agent's radius
 PLUME = 1.7  # length of a plume at the thrust scale, as a share of the agent's radius
+CROWD = 64  # more agents than this are drawn as discs, goals as points, with trails that fade
+TAIL = 12  # frames of a crowd's trails
 TUBE_PERIOD = 0.5  # from disc to disc of a planned tube [s]
 # For each thruster, in the body's axes and in units of half the body: where it sits, and where its
 # plume points. The plume leaves against the force.
@@ -87,6 +89,10 @@ class SpacecraftRenderer(Canvas):
         self._fit(world)
         self._clear()
         self._draw_arena()
+        if world.agents > CROWD:
+            self._draw_crowd(world)
+            self._draw_panel(world, time)
+            return self._shown()
         self._draw_sensing(world)
         self._draw_planned_tubes(world)
         self._draw_obstacles(world)
@@ -129,6 +135,30 @@ class SpacecraftRenderer(Canvas):
         area = self._pygame.Rect(round(left), round(top), round(right - left), round(bottom - top))
         self._canvas.fill((248, 248, 248), area)
         self._pygame.draw.rect(self._canvas, mix(GREY, 0.5), area, 2)
+
+    def _draw_crowd(self, world: SpacecraftWorld) -> None:
+        """Draw many agents: where they are, were and go, who has arrived and who collided."""
+        self._draw_obstacles(world)
+        draw, canvas = self._pygame.draw, self._canvas
+        size = max(2.0, float(world.agent_radius[0]) * self._scale)
+        arrived, collided = np.isfinite(world.success_time[0]), world.collided[0]
+        for agent, goal in enumerate(self._points(world.goals[:, 0])):
+            if not arrived[agent]:
+                draw.circle(canvas, mix(self._colour(agent), 0.45), goal, 0.5 * size)
+        tails = [self._points(places.T) for _, places in self._trail[-TAIL:]]
+        if len(tails) > 1:
+            for agent, tail in enumerate(zip(*tails, strict=True)):
+                draw.lines(canvas, mix(self._colour(agent), 0.5), False, tail, OVERSAMPLING)
+        for agent, place in enumerate(self._points(world.parts[:2, 0])):
+            colour = VERMILLION if collided[agent] else self._colour(agent)
+            draw.circle(canvas, colour, place, size)
+            if arrived[agent]:
+                draw.circle(canvas, BLACK, place, size, max(1, round(0.3 * size)))
+
+    def _points(self, places: FloatArray) -> list[Point]:
+        """Return where places (2, n) are on the canvas."""
+        across, up = (places - self._low[:, None]) * self._scale
+        return list(zip(across.tolist(), (VIEW * OVERSAMPLING - up).tolist(), strict=True))
 
     def _draw_obstacles(self, world: SpacecraftWorld) -> None:
         for centre, radius in zip(
@@ -264,16 +294,25 @@ class SpacecraftRenderer(Canvas):
             ("cross", VERMILLION, "collided"),
             ("disc", mix(GREY, 0.75), "obstacle"),
         ]
-        if world.nominal is not None:
+        if world.agents > CROWD:
+            keys = [
+                ("disc", mix(BLUE, 0.45), "goal"),
+                ("disc", BLUE, "on its way"),
+                ("rim", BLUE, "arrived"),
+                ("disc", VERMILLION, "collided"),
+                ("disc", mix(GREY, 0.75), "obstacle"),
+            ]
+        elif world.nominal is not None:
             keys.append(("tube", mix(BLUE, 0.2), "plan x_d in its tube"))
         for index, (shape, colour, label) in enumerate(keys):
             level = (200 + 26 * index) * OVERSAMPLING
             self._draw_key(shape, colour, label, left + 28 * OVERSAMPLING, level)
         start = (left + 16 * OVERSAMPLING, (VIEW - 24) * OVERSAMPLING)
-        end = (start[0] + self._scale, start[1])
+        length = 1.0 if self._side < 30.0 else 10.0
+        end = (start[0] + length * self._scale, start[1])
         self._pygame.draw.line(self._canvas, GREY, start, end, 2 * OVERSAMPLING)
         beside = (end[0] + 8 * OVERSAMPLING, start[1])
-        self._text("1 m", beside, GREY, 17, anchor="midleft")
+        self._text(f"{length:g} m", beside, GREY, 17, anchor="midleft")
 
     def _draw_key(self, shape: str, colour: Colour, label: str, across: int, level: int) -> None:
         pygame, unit = self._pygame, OVERSAMPLING

@@ -229,7 +229,9 @@ def action_space() -> spaces.Box:
     return spaces.Box(0.0, 1.0, (task.THRUSTERS,), np.float32)
 
 
-def one_info(info: dict[str, Any], agent: int) -> dict[str, Any]:
-    """Return the info of one agent of the first world, numbers as Python's own."""
-    rows = {name: value[0, agent] for name, value in info.items()}
-    return {name: row.copy() if np.ndim(row) else row.item() for name, row in rows.items()}
+def infos_by_agent(info: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the info of each agent of the first world, numbers as Python's own."""
+    columns = [
+        value[0].tolist() if value.ndim == 2 else list(value[0].copy()) for value in info.values()
+    ]
+    return [dict(zip(info, row, strict=True)) for row in zip(*columns, strict=True)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -21,7 +22,7 @@ from lagros_envs.tasks.spacecraft.episode import (
     OneWorld,
     SpacecraftEpisode,
     action_space,
-    one_info,
+    infos_by_agent,
 )
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import global_state, named_state_space, observe
@@ -215,10 +216,10 @@ class SpacecraftParallelEnv(OneWorld, ParallelEnv[str, Float32Array, Float32Arra
         if not self.agents:
             EnvLogger.warn_step_after_terminated_truncated()
             return {}, {}, {}, {}, {}
-        forces = np.stack([self._force(actions, agent) for agent in self.agents])
+        values = self._checked(actions)
         for agent in actions:
             self._known(agent)
-        outcome = self.episode.step(forces)
+        outcome = self.episode.step(task.applied_forces(self.settings, values))
         agents = self.agents
         rewards, terminations, truncations = (
             dict(zip(agents, part[0].tolist(), strict=True)) for part in outcome
@@ -248,21 +249,30 @@ class SpacecraftParallelEnv(OneWorld, ParallelEnv[str, Float32Array, Float32Arra
             )
         return agent
 
-    def _force(self, actions: dict[str, Float32Array], agent: str) -> FloatArray:
+    def _checked(self, actions: Mapping[str, Any]) -> FloatArray:
+        """Return the actions of all agents, shape (agents, 8), or refuse the first that is none."""
+        wanted = self.agents
+        given = [actions.get(agent) for agent in wanted]
+        # All at once: where there is a fault the agents are looked at one by one.
+        if all(type(one) is np.ndarray and one.dtype.kind == "f" for one in given):
+            with suppress(ValueError):
+                return checked_actions(given, (len(wanted), task.THRUSTERS), task.ACTION)
+        return np.stack([self._action(actions, agent) for agent in wanted])
+
+    def _action(self, actions: Mapping[str, Any], agent: str) -> FloatArray:
         if agent not in actions:
             raise ValueError(
                 f"the actions lack {agent!r}; give one to each of {', '.join(self.agents)}"
             )
         try:
-            values = checked_actions(actions[agent], (task.THRUSTERS,), task.ACTION)
+            return checked_actions(actions[agent], (task.THRUSTERS,), task.ACTION)
         except ValueError as error:
             raise ValueError(f"{agent}: {error}") from None
-        return task.applied_forces(self.settings, values)
 
     def _observations(self) -> dict[str, Float32Array]:
         rows = observe(self.episode.world, self.episode.layout)[0]
         return dict(zip(self.possible_agents, rows, strict=True))
 
     def _infos(self) -> dict[str, dict[str, Any]]:
-        info = self.episode.world.info()
-        return {agent: one_info(info, index) for index, agent in enumerate(self.possible_agents)}
+        rows = infos_by_agent(self.episode.world.info())
+        return dict(zip(self.possible_agents, rows, strict=True))

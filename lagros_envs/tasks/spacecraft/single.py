@@ -16,7 +16,7 @@ from lagros_envs.tasks.spacecraft.episode import (
     OneWorld,
     SpacecraftEpisode,
     action_space,
-    one_info,
+    infos_by_agent,
 )
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import observe
@@ -122,7 +122,7 @@ class SpacecraftEnv(OneWorld, gym.Env[Float32Array, Float32Array]):
         return cast(Float32Array, observe(self.episode.world, self.episode.layout)[0, 0])
 
     def _info(self) -> dict[str, Any]:
-        return one_info(self.episode.world.info(), 0)
+        return infos_by_agent(self.episode.world.info())[0]
 
 
 def _with_agents(options: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
