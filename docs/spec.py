@@ -162,9 +162,13 @@ def _presets(task: SpacecraftSettings) -> Iterator[str]:
             times = f"({times}) · √(n/{preset.agents})"
         given = dict(preset.task)
         other = [f"{key} {given[key]:g}" for key in given if key not in ("horizon", "time_limit")]
+        radius = f"{preset.obstacle_radius:.3g}"
+        if preset.rectangle_sides is not None and preset.obstacle_count[1]:
+            least, most = (side / math.sqrt(math.pi) for side in preset.rectangle_sides)
+            radius = f"{least:.2f} to {most:.2f}"
         yield (
             f"| `{name}` | {preset.agents} | {arena} | {count} | "
-            f"{preset.obstacle_radius:.3g}, {preset.agent_radius:g}, {preset.core:g} | {times} | "
+            f"{radius}, {preset.agent_radius:g}, {preset.core:g} | {times} | "
             f"{', '.join(other) or '–'} |"
         )
 

@@ -211,9 +211,10 @@ class Preset:
 # lengths and times five times its own. So speeds stay as they are, 0.5 m/s along each axis, and
 # accelerations become 2 m/s^2 along each axis: two thrusters of 1 N at 1 kg. Its own numbers:
 # radius 0.05, sensing 0.5, arrived within 0.1, starts and goals 0.2 apart and from obstacles,
-# rectangles with sides of 0.1 to 0.5, eight agents in a square of side 4 at its density, 256 steps
-# of 0.03 s in a square of that side, and more in a larger one. T is two thirds of the limit, as in
-# the paper.
+# rectangles with sides of 0.1 to 0.5, eight agents in a square of side 4 at its density. Its
+# episodes have 256 steps of 0.03 s unless told otherwise, less than it takes to cross that square
+# at its speed, and are to be longer in larger ones: here twice as long, times the side (77 s is
+# 512 steps, in whole half seconds). T is two thirds of that, as in the paper.
 _GCBF = Preset(
     agents=8,
     arena=20.0,
@@ -230,11 +231,11 @@ _GCBF = Preset(
     parked=True,
     task=(
         ("goal_radius", 0.5),
-        ("horizon", 25.6),
+        ("horizon", 51.0),
         ("sensing_radius", 2.5),
         ("speed_limit", 0.5),
         ("thrust_limit", 1.0),
-        ("time_limit", 38.4),
+        ("time_limit", 77.0),
     ),
 )
 

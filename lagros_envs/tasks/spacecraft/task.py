@@ -160,12 +160,16 @@ def before_growth(settings: SpacecraftSettings, preset: Preset) -> SpacecraftSet
 
 
 def _slower(settings: SpacecraftSettings, scale: float) -> SpacecraftSettings:
-    """Return the settings with T and the time limit times a factor, in whole control periods."""
+    """Return the settings with T and the time limit times a factor, in whole half seconds.
+
+    Plans have their nodes there; where the control period does not divide it, the nearest that it
+    divides.
+    """
     if scale == 1.0:
         return settings
-    period = settings.control_period
+    step = settings.control_period * max(1, round(0.5 / settings.control_period))
     horizon, limit = (
-        round(math.ceil(scale * time / period - 1e-6) * period, 9)
+        round(math.ceil(scale * time / step - 1e-6) * step, 9)
         for time in (settings.horizon, settings.time_limit)
     )
     return replace(settings, horizon=horizon, time_limit=limit)
