@@ -125,6 +125,14 @@ def test_what_is_found_worst_is_what_lagros_attack_finds(flown, slide, tmp_path)
             assert row["scores"] == [one["score"] for one in found["outcomes"]]
     text = (out / "all.md").read_text()
     assert "Success [%] of 2 episodes under the worst disturbance" in text
+    assert "budget of 20 flights each" in text
+    for policy in ("tube-mpc", "lqr"):
+        assert f"{policy} {_mean_worst(result, policy):.0f} %" in text.partition("## ")[0]
+
+
+def _mean_worst(result, policy):
+    rows = [row for row in result["worst"] if (row["policy"], row["goal"]) == (policy, "success")]
+    return 100.0 * sum(row["success_rate"] for row in rows) / len(rows)
 
 
 def test_a_policy_with_a_memory_is_not_searched_and_it_is_said(slide):
@@ -152,7 +160,7 @@ def test_what_is_printed_fits_a_terminal_and_leaves_no_system_out(count):
     text = console.file.getvalue()
     assert max(map(len, map(str.rstrip, text.splitlines()))) <= 80
     assert all(text.count(name.partition("-")[2]) == 2 for name in names)
-    assert text.count("100/100") == text.count("40 12.3") == 2 * count
+    assert text.count("100/100") == text.count("40, 12.3") == 2 * count
 
 
 def test_it_goes_on_where_it_was_and_is_drawn_again_without_flying(flown, slide, monkeypatch):
@@ -236,6 +244,7 @@ def test_ahead_is_a_whole_interval_below_one_under_every_kind_and_of_every_rival
     assert System(rows).ahead(MEASURES[1], "tube-mpc", "c3m") is False
     best = [made_up("lagros", *key, {**ratios, "sd-lqr": 0.5}) for key in _keys()]
     settings = {"episodes": 9, "fewer": {}, "disturbances": ["uniform", "constant"], "jobs": 1}
+    settings |= {"worst_flights": 20}
     result = {
         "rows": [*rows, *best],
         "missing": [],

@@ -96,7 +96,8 @@ class ArmSettings(Task):
         near = np.arange(count)
         while len(near):
             goal[near, :2] = upright + rng.uniform(-1.0, 1.0, (len(near), 2)) * _REACH
-            near = near[self.goal_distance(start[near].T, goal[near].T, np) < _WAY]
+            here, there = list(start[near].T), list(goal[near].T)
+            near = near[self.goal_distance(here, there, np) < _WAY]
         return Scenario(start, goal, np.zeros((count, 0, 3)))
 
     def tip(self, state: Sequence[Any], functions: Any) -> tuple[Any, Any]:
