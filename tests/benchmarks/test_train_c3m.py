@@ -52,8 +52,10 @@ def test_the_candidate_that_flies_best_is_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(c3m, "_flown", figures)
     place = Place(tmp_path / "run")
     record = c3m.train(C3mRun("segway", TINY, enough=1.0), place)
-    assert [one["candidate"] for one in record["scan"]] == [asdict(one) for one in SCAN]
-    assert record["chosen"] == asdict(SCAN[2])
+    rates = (0.5, 0.5, 1.0)  # episodes are six seconds long
+    tried = [asdict(one) | {"rate": rate} for one, rate in zip(SCAN, rates, strict=True)]
+    assert [one["candidate"] for one in record["scan"]] == tried
+    assert record["chosen"] == tried[2]
     # The weights and the region are its own: the middle of the box is in the file.
     law = ContractionNetworks.load(place.weights)
     region = region_of(task_named("segway"), 0, met=True)
@@ -66,7 +68,7 @@ def test_no_other_is_tried_where_the_first_keeps_its_promise(tmp_path):
     run = C3mRun("segway", TINY, enough=0.0, scan_episodes=1, final_episodes=1)
     record = c3m.train(run, Place(tmp_path / "run"))
     assert len(record["scan"]) == 1
-    assert record["chosen"] == asdict(SCAN[0])
+    assert record["chosen"] == asdict(SCAN[0]) | {"rate": 0.5}
 
 
 def test_a_candidate_is_as_fast_as_episodes_are_long():

@@ -323,6 +323,9 @@ def _system_blocks(system: System, result: dict[str, Any], page: Path) -> Iterat
     first = system.first
     units = (first.get("units") or {}).get("state") or "those of the state"
     beside = result["settings"]["initial_error"]
+    count = max(system.episodes)
+    if count != result["settings"]["episodes"]:
+        yield f"Of an earlier run, with {count} episodes."
     yield (
         f"d̄ = {first['bound']:g} per second, units {units}. area: ∫‖x − x_d‖ dt of episodes that "
         f"begin on their plan; the next four columns: of those that begin beside it, by up to "

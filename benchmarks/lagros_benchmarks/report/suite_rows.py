@@ -58,6 +58,11 @@ class System:
         """Any of its rows."""
         return next(iter(self._rows.values()))
 
+    @property
+    def episodes(self) -> list[int]:
+        """Numbers of episodes of its rows."""
+        return [row["episodes"] for row in self._rows.values()]
+
     def row(self, policy: str, kind: str, beside: bool = False) -> Row | None:
         """Return the row of a policy under a kind, of episodes on or beside their plan."""
         return self._rows.get((policy, kind, beside, False))

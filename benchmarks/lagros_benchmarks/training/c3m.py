@@ -104,7 +104,8 @@ def _tried(run: C3mRun, task: Task, place: Place, number: int, tell: Progress) -
     trained_for = training_of(task).range(timed=False)
     networks = made.frozen_copy(weights_record(task.name, run.label, trained_for))
     figures = _flown(task, networks, run.scan_episodes, _SCANNED)
-    said = {"candidate": asdict(candidate), "conditions": observed, "figures": figures}
+    tried = {**asdict(candidate), "rate": settings.rate}
+    said = {"candidate": tried, "conditions": observed, "figures": figures}
     return _Tried(networks, asdict(region), said)
 
 
