@@ -29,7 +29,7 @@ ELSEWHERE = {
     r"python benchmarks/speed/tasks.py": "tests/benchmarks/test_speed.py",
     r"lagros .*--backend (ray|dask)": "tests/benchmarks/test_backends.py",
     r"lagros leaderboard": "tests/benchmarks/test_leaderboard.py",
-    r"lagros train \S+ --algo missing": "tests/benchmarks/test_train_c3m.py",
+    r"lagros train \S+ --algo (c3m|missing)": "tests/benchmarks/test_train_c3m.py",
     r"python benchmarks/studies/reproduction_table.py": (
         "tests/benchmarks/test_reproduction_table.py"
     ),
