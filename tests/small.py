@@ -59,6 +59,7 @@ SMALL = {
     ),
     "train": ("--segments", "1", "--seed", "0", "--quiet"),
     "watch": ("--seconds", "0.5"),
+    "python benchmarks/speed/spacecraft_world.py": ("--sizes", "1x8", "--rounds", "1"),
     "python benchmarks/studies/plan_law.py": ("--episodes", "1"),
     "python benchmarks/studies/plan_tubes.py": (
         "--tasks",

@@ -112,11 +112,18 @@ def test_what_a_page_says_runs(page: Path, tmp_path: Path) -> None:
     if name(page) in PREPARED:
         run("python", "-c", _HEAD + PREPARED[name(page)])
     first_half.write_modules(text, tmp_path)
+    # What is typed above the first snippet comes first; it may make what the snippet reads.
+    above = len(text.partition("```python\n")[0].splitlines())
+    typed = [(one.line, one.words) for one in documents.commands(text)]
+    before = [words for line, words in typed if line <= above]
     blocks = [small.smaller(block) for block in documents.python_blocks(text)]
-    if name(page) not in _OF_A_TEST:
-        (tmp_path / "blocks.py").write_text("\n\n".join(blocks), encoding="utf-8")
-        run("python", "blocks.py")
-    for words in own(page):
-        made = small.small(words)
-        assert made is not None
-        run(*made)
+    (tmp_path / "blocks.py").write_text("\n\n".join(blocks), encoding="utf-8")
+    python = [] if name(page) in _OF_A_TEST else [("python", "blocks.py")]
+    after = [words for line, words in typed if line > above]
+    for words in [*before, *python, *after]:
+        if words == ("python", "blocks.py"):
+            run(*words)
+        elif small.runner(name(page), words) is None:
+            made = small.small(words)
+            assert made is not None
+            run(*made)
