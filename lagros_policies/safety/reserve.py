@@ -31,8 +31,8 @@ the hull of what the rule is kept for. Braking keeps the segment within itself, 
 + K, and in the zone wherever the zone is chosen. QED.
 
 A disc that does not move is kept off by the tangent at its nearest point to R_i. At an instant the
-nominal motion may also be moved towards the actual one, by any share, if the rule holds for that:
-where nothing is near the two are the same, and the body remembers nothing.
+nominal motion may also be moved towards the actual one, if the rule holds for that: where nothing
+is near the two are the same, and the body remembers nothing.
 """
 
 from __future__ import annotations
@@ -47,6 +47,8 @@ from lagros_envs.checks import check_fields
 
 # Bounds distances of centres from below where two are in the same place.
 _SAME_PLACE = 1e-9
+# So far outside, a point still lies in its zone [m].
+_ON_EDGE = 1e-12
 # sin(theta) at most; in the invariant set it is less.
 _WIDEST = 0.95
 
@@ -129,6 +131,12 @@ class Zones(NamedTuple):
         value: FloatArray = self.x * vectors[:, :1] + self.y * vectors[:, 1:]
         return value
 
+    def hold(self, place: FloatArray, stop: FloatArray) -> BoolArray:
+        """Return beside whom both of two points (B, 2) lie in the zone, shape (B, s)."""
+        nearer = np.minimum(self.along(place), self.along(stop))
+        held: BoolArray = (nearer >= self.least - _ON_EDGE) | ((self.x == 0.0) & (self.y == 0.0))
+        return held
+
     @classmethod
     def joined(cls, first: Zones, second: Zones) -> Zones:
         """Put the zones of two kinds of others side by side."""
@@ -208,48 +216,78 @@ def zones_beside_discs(
 
 
 class Restart(NamedTuple):
-    """How far the nominal motion may move towards the actual one.
+    """Nominal motions that were moved towards the actual ones.
 
     Attributes:
-        share: Of the error, shape (B,).
-        inside: Beside whom all that is reserved then lies in the zone, shape (B, s).
+        place: p_n, relative to the actual position, shape (B, 2) [m].
+        stop: s_n, likewise.
+        inside: Beside whom all that is reserved lies in the zone, shape (B, s).
     """
 
-    share: FloatArray
+    place: FloatArray
+    stop: FloatArray
     inside: BoolArray
 
 
-def restart(
-    zones: Zones, place: FloatArray, stop: FloatArray, allowed: BoolArray | None = None
-) -> Restart:
-    """Return the largest share that keeps the rule.
+def restart(zones: Zones, place: FloatArray, stop: FloatArray, aim: FloatArray) -> Restart:
+    """Move nominal motions towards the actual ones as far as the rule lets them.
+
+    All the way where that is kept; else along the edge of the zone that is in the way, and then
+    towards it. What is left of the error is its parts along two axes, each smaller: the set of
+    errors is convex and the same after a reflection, so that it holds that, too.
 
     Args:
         zones: Beside all others.
         place: p_n, relative to the actual position, which is what it moves to, shape (B, 2) [m].
-        stop: s_n likewise, and where the actual motion would stop, shape (B, 2, 2) [m].
-        allowed: Who may move it at all, shape (B,); None for all.
+        stop: s_n, likewise.
+        aim: Where the actual motion would stop, likewise.
     """
-    aim = stop[:, 1]
-    first, second, last = zones.along(place), zones.along(stop[:, 0]), zones.along(aim)
-    present = (zones.x != 0.0) | (zones.y != 0.0)
-    edge = zones.least - 1e-12
-    inside = (np.minimum(first, second) >= edge) | ~present
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.minimum(
-            np.where(first > 0.0, (first - edge) / first, np.inf),
-            np.where(second > last, (second - edge) / (second - last), np.inf),
+    inside = zones.hold(place, stop)
+    lands = zones.hold(np.zeros_like(place), aim)
+    shares = np.where(lands, 1.0, _shares(zones, inside, (place, stop), (0.0 * place, aim)))
+    if not shares.shape[1]:
+        return Restart(np.zeros_like(place), aim, inside)
+    share = shares.min(axis=1)
+    # Beside who is moved from outside into the zone at once there is no halfway.
+    whole = share >= 1.0
+    moved = np.where(whole[:, None], 0.0, place), np.where(whole[:, None], aim, stop)
+    rows = np.flatnonzero(~whole)
+    if rows.size:
+        some, within = Zones(*(part[rows] for part in zones)), inside[rows]
+        here, there = (place[rows], stop[rows]), (0.0 * place[rows], aim[rows])
+        index = np.arange(rows.size)
+        worst = np.argmin(shares[rows], axis=1)
+        edge = np.stack([-some.y[index, worst], some.x[index, worst]], axis=-1)
+        beside = tuple(
+            one + edge * np.sum(edge * (other - one), axis=1, keepdims=True)
+            for one, other in zip(here, there, strict=True)
         )
-    lands = np.minimum(0.0, last) >= edge
-    moved, turned = np.hypot(*place.T)[:, None], np.hypot(*(aim - stop[:, 0]).T)[:, None]
-    away = (-first >= zones.sine * moved) & (last - second >= zones.sine * turned)
-    per_other = np.where(inside, np.clip(shares, 0.0, 1.0), np.where(lands | away, 1.0, 0.0))
-    share = per_other.min(axis=1, initial=1.0)
-    jumps = np.any(~inside & lands & ~away, axis=1)
-    share = np.where(jumps & (share < 1.0), 0.0, share)
-    if allowed is not None:
-        share = np.where(allowed, share, 0.0)
-    return Restart(share, inside | (lands & (share == 1.0)[:, None]))
+        for target in (beside, there):
+            share = _shares(some, within, here, target).min(axis=1)[:, None]
+            here = tuple(
+                one + share * (other - one) for one, other in zip(here, target, strict=True)
+            )
+        moved[0][rows], moved[1][rows] = here
+    return Restart(*moved, inside | (lands & whole[:, None]))
+
+
+def _shares(
+    zones: Zones,
+    inside: BoolArray,
+    here: tuple[FloatArray, ...],
+    there: tuple[FloatArray, ...],
+) -> FloatArray:
+    """Return the largest shares of a move of p_n and s_n that keep the rule, shape (B, s)."""
+    shares: FloatArray = np.ones(inside.shape)
+    away = np.ones(inside.shape, bool)
+    for one, other in zip(here, there, strict=True):
+        begun, way = zones.along(one), zones.along(other - one)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            until = np.where(way < 0.0, (zones.least - _ON_EDGE - begun) / way, 1.0)
+        shares = np.minimum(shares, until)
+        away &= way >= zones.sine * np.hypot(*(other - one).T)[:, None]
+    value: FloatArray = np.where(inside, np.maximum(shares, 0.0), away)
+    return value
 
 
 def limits_beyond_braking(

@@ -46,7 +46,7 @@ def drawn_pairs(rng, count):
     return place, speed, place + error, speed + (stop_error - error) / beta
 
 
-@pytest.mark.parametrize("moves", [0.0, 1.0])
+@pytest.mark.parametrize("moves", [False, True])
 def test_two_that_keep_the_rule_stay_apart(moves):
     """Whatever both choose: the segments stay L apart, and the bodies in between."""
     rng, count, beta, h = np.random.default_rng(0), 4000, RESERVE.stopping_time, RESERVE.period
@@ -62,14 +62,11 @@ def test_two_that_keep_the_rule_stay_apart(moves):
             RESERVE, 0.25, moving[:, own], apart[:, None], np.ones((count, 1), bool)
         )
         near = place[:, own] - actual[:, own]
-        stops = np.stack([near + beta * speed[:, own], beta * moving[:, own]], axis=1)
-        moved = restart(zones, near, stops)
-        share = moves * moved.share[:, None]
-        near = (1.0 - share) * near
-        pace = speed[:, own] + share * (moving[:, own] - speed[:, own])
-        inside = (
-            moved.inside if moves else restart(zones, near, stops, np.zeros(count, bool)).inside
-        )
+        stop = near + beta * speed[:, own]
+        inside, pace = zones.hold(near, stop), speed[:, own]
+        if moves:
+            near, stop, inside = restart(zones, near, stop, beta * moving[:, own])
+            pace = (stop - near) / beta
         normals, bounds = limits_beyond_braking(RESERVE, zones, inside, near, pace)
         # Towards the other, across, or anywhere, as far as the rule lets it.
         wish = in_disc(rng, count, 30.0) + 10.0 * rng.random((count, 1)) * apart[:, :2]

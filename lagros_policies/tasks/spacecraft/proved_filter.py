@@ -101,19 +101,13 @@ class ProvedFilter(ActionFilter):
         nominal = self._nominal(sensed, memory)
         zones = self._zones(sensed, nominal)
         outside = self._outside(sensed, nominal, zones)
-        beta = reserve.stopping_time
-        stops = np.stack([nominal.place + beta * nominal.speed, beta * sensed.velocity], axis=1)
-        slow = np.hypot(*sensed.velocity.T) <= self.reserved.speed
-        moved = restart(zones, nominal.place, stops, slow)
-        share = moved.share[:, None]
-        place = nominal.place * (1.0 - share)
-        speed = nominal.speed + share * (sensed.velocity - nominal.speed)
+        place, speed, inside = self._moved(sensed, nominal, zones)
         answer = gain.deviation(-place, sensed.velocity - speed)
         braking = -reserve.braking_rate * speed
         wrench, _, wanted = self.wanted(actions, sensed)
         torque = self._torque(wrench[:, 2], sensed.spin)
         beyond = wanted - answer - braking
-        normals, bounds = limits_beyond_braking(reserve, zones, moved.inside, place, speed)
+        normals, bounds = limits_beyond_braking(reserve, zones, inside, place, speed)
         extra = nearest_beyond(beyond, normals, bounds)
         extra *= self._most(braking, speed, extra)[:, None]
         changed = np.any(np.abs(extra - beyond) > _SAME, axis=1) | (torque != wrench[:, 2])
@@ -155,6 +149,23 @@ class ProvedFilter(ActionFilter):
             zones_beside_discs(
                 reserve, preset.core, nominal.place, stop, sensed.obstacles, sensed.obstacle_mask
             ),
+        )
+
+    def _moved(
+        self, sensed: Sensed, nominal: Nominal, zones: Zones
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return p_n and v_n, moved towards the actual motion, and who then is in which zone."""
+        beta = self.reserved.reserve.stopping_time
+        stop = nominal.place + beta * nominal.speed
+        moved = restart(zones, nominal.place, stop, beta * sensed.velocity)
+        speed = (moved.stop - moved.place) / beta
+        # Who would be too fast goes on as it was.
+        fast = (np.hypot(*speed.T) > self.reserved.speed)[:, None]
+        inside = moved.inside & (~fast | zones.hold(nominal.place, stop))
+        return (
+            np.where(fast, nominal.place, moved.place),
+            np.where(fast, nominal.speed, speed),
+            inside,
         )
 
     def _outside(self, sensed: Sensed, nominal: Nominal, zones: Zones) -> BoolArray:
