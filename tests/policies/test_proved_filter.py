@@ -367,3 +367,30 @@ def test_an_episode_that_starts_forgets_the_nominal_motions():
     _, after = wearing.predict(later, moved, starts)
     # Who goes on cannot be five metres from its nominal motion.
     assert wearing.counters(after)["infeasible"] == np.sum(~starts)
+
+
+class Seek(Rush):
+    """Each flies to its own goal, at a moderate pace."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        sensed = Sensed.of(self.layout, observation)
+        distance = np.linalg.norm(sensed.goal, axis=1, keepdims=True)
+        push = 3.0 * (0.5 * sensed.goal / np.maximum(distance, 0.5) - sensed.velocity)
+        force = to_body(push, sensed.heading)
+        thrust = allocate(TASK.system, np.concatenate([force, 0.0 * force[:, :1]], axis=1))
+        return thrust.astype(np.float32), None
+
+
+def test_who_meet_head_on_pass_each_other():
+    """Goals opposite to starts on a circle: the filter leaves the way around, and leads there."""
+    ring = dataclasses.replace(PRESETS["crossing"], agents=2)
+    env = worlds(ring, "none", 6)
+    wearing = proved(ring)(Seek(env))
+    observation, info = env.reset(seed=list(range(6)))
+    state = None
+    for _ in range(250):
+        action, state = wearing.predict(observation, state)
+        observation, *_, info = env.step(action)
+    assert info["success"].all()
+    assert not info["collided"].any()
+    assert wearing.counters(state)["interventions"] > 0

@@ -11,12 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.observed import as_numbers
 from lagros_policies.policy import BasePolicy, Policy, PolicyState, as_policy
+from lagros_policies.safety.barrier import BarrierSettings
 from lagros_policies.tasks.spacecraft.sensed import Sensed, WorldState
 from lagros_policies.tasks.spacecraft.setup import task_and_preset
 from lagros_policies.tasks.spacecraft.thrusters import to_body
@@ -24,6 +25,10 @@ from lagros_policies.tasks.spacecraft.thrusters import to_body
 Counts = NDArray[np.int64]
 
 COUNTERS = ("filtered_steps", "interventions", "infeasible")
+# An agent is blocked if the goal lies within this cosine of behind what it must not touch ...
+_FACING = 0.7
+# ... and it passes clockwise, unless it already passes faster than this the other way [m/s].
+_ALREADY_PASSING = 0.05
 
 
 class FilterState(NamedTuple):
@@ -101,6 +106,48 @@ class ActionFilter(BasePolicy):
         turn = wrench[:, 2] / (2.0 * body.inertia)
         middle = sensed.heading + 0.5 * h * sensed.spin + 0.125 * h * h * turn
         return Wanted(wrench, middle, to_body(wrench[:, :2] / body.mass, -middle))
+
+    def sidestep(
+        self,
+        kept: BarrierSettings,
+        rows: IntArray,
+        normal: FloatArray,
+        passing: FloatArray,
+        sensed: Sensed,
+    ) -> FloatArray:
+        """Return what to add to the acceleration of agents that are blocked, (k, 2) [m/s^2].
+
+        Two agents that meet head-on, and an agent behind an obstacle, would wait for ever where the
+        filter leaves only the way back. An agent that does not get on, and whose goal lies behind
+        what it must not touch, is pushed along the rim until it passes at the sidestep's speed:
+        clockwise, or the way in which it already passes. Both agents of a pair find the same sense
+        of turning about each other.
+
+        Args:
+            kept: Speeds and rate of the sidestep.
+            rows: Which agents, shape (k,).
+            normal: From what each must not touch to it, of length one, shape (k, 2).
+            passing: Its velocity relative to that, shape (k, 2) [m/s].
+            sensed: What all agents sense.
+        """
+        x, y = normal[:, 0], normal[:, 1]
+        goal, velocity = sensed.goal[rows], sensed.velocity[rows]
+        distance = np.sqrt(np.sum(goal * goal, axis=-1))
+        behind = -(x * goal[:, 0] + y * goal[:, 1]) > _FACING * distance
+        along = np.stack([y, -x], axis=-1)
+        clockwise = y * passing[:, 0] - x * passing[:, 1]
+        along = np.where((clockwise < -_ALREADY_PASSING)[:, None], -along, along)
+        lacking = np.maximum(kept.sidestep_speed - np.sum(along * velocity, axis=-1), 0.0)
+        # Who has arrived stays.
+        progress = np.sum(velocity * goal, axis=-1)
+        blocked = (
+            behind
+            & (distance > self.settings.goal_radius)
+            & (progress < kept.blocked_speed * distance)
+        )
+        size = kept.sidestep_rate * blocked * lacking
+        push: FloatArray = size[:, None] * along
+        return push
 
     def _filtered(
         self, actions: NDArray[Any], sensed: Sensed, memory: FloatArray | None

@@ -18,6 +18,7 @@ from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_policies.policy import Policy
+from lagros_policies.safety.barrier import BarrierSettings
 from lagros_policies.safety.half_planes import nearest
 from lagros_policies.safety.reserve import (
     Zones,
@@ -86,6 +87,7 @@ class ProvedFilter(ActionFilter):
         super().__init__(policy, settings, preset, num_agents)
         self.name = f"{self.policy.name}+proved"
         self.disturbance_bound = disturbance_bound
+        self._steps = BarrierSettings.for_bound(disturbance_bound)
         self.reserved = reserved_for(self.settings, self.preset, disturbance_bound, reserve)
         missed = [one.text for one in self.reserved.statements if not one.holds]
         if missed:
@@ -108,7 +110,8 @@ class ProvedFilter(ActionFilter):
         torque = self._torque(wrench[:, 2], sensed.spin)
         beyond = wanted - answer - braking
         normals, bounds = limits_beyond_braking(reserve, zones, inside, place, speed)
-        extra = nearest_beyond(beyond, normals, bounds)
+        target = beyond + self._aside(beyond, zones, normals, bounds, sensed)
+        extra = nearest_beyond(target, normals, bounds)
         extra *= self._most(braking, speed, extra)[:, None]
         changed = np.any(np.abs(extra - beyond) > _SAME, axis=1) | (torque != wrench[:, 2])
         extra = np.where(changed[:, None], extra, beyond)
@@ -167,6 +170,41 @@ class ProvedFilter(ActionFilter):
             np.where(fast, nominal.speed, speed),
             inside,
         )
+
+    def _aside(
+        self,
+        wanted: FloatArray,
+        zones: Zones,
+        normals: FloatArray,
+        bounds: FloatArray,
+        sensed: Sensed,
+    ) -> FloatArray:
+        """Return what is added for those who are blocked, shape (B, 2) [m/s^2]."""
+        push = np.zeros_like(wanted)
+        lack = bounds - normals[..., 0] * wanted[:, :1] - normals[..., 1] * wanted[:, 1:]
+        rows = np.flatnonzero(np.max(lack, axis=1) > 0.0)
+        if not rows.size:
+            return push
+        slots, others = zones.x.shape[1], sensed.neighbour_mask.shape[1]
+        worst = np.argmax(lack[rows], axis=1) % slots
+        at = rows, np.minimum(worst, others - 1)
+        normal = np.stack([zones.x[rows, worst], zones.y[rows, worst]], axis=-1)
+        # What is no neighbour rests.
+        moving = (worst < others)[:, None]
+        relative = np.where(moving, -sensed.neighbours[at][:, 2:], sensed.velocity[rows])
+        push[rows] = self.sidestep(self._steps, rows, normal, relative, sensed)
+        return push
+        slots, others = zones.x.shape[1], sensed.neighbour_mask.shape[1]
+        worst = np.argmax(lack[rows], axis=1) % slots
+        at = rows, np.minimum(worst, others - 1)
+        normal = np.stack([zones.x[rows, worst], zones.y[rows, worst]], axis=-1)
+        theirs = np.where(
+            (worst < others)[:, None], sensed.velocity[rows] + sensed.neighbours[at][:, 2:], 0.0
+        )
+        push[rows] = self.sidestep(
+            self._steps, rows, normal, sensed.velocity[rows] - theirs, sensed
+        )
+        return push
 
     def _outside(self, sensed: Sensed, nominal: Nominal, zones: Zones) -> BoolArray:
         """Return who can tell that the state is not in the set that is kept, shape (B,)."""

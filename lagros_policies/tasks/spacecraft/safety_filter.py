@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
 from lagros_envs.checks import check_instance
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_policies.policy import Policy
-from lagros_policies.safety.barrier import BarrierSettings, BrakingBarrier, HalfPlanes
+from lagros_policies.safety.barrier import BarrierSettings, BrakingBarrier
 from lagros_policies.safety.half_planes import nearest
 from lagros_policies.tasks.spacecraft.filtering import ActionFilter
 from lagros_policies.tasks.spacecraft.sensed import Sensed
@@ -31,10 +31,6 @@ _ROUNDING = 1e-6
 # Where not all can be kept, this share of the violation falls to obstacles: a neighbour that comes
 # too close gives way, an obstacle does not.
 _OBSTACLE_SOFTNESS = 0.3
-# An agent is blocked if the goal lies within this cosine of behind what it must not touch ...
-_FACING = 0.7
-# ... and it passes clockwise, unless it already passes faster than this the other way [m/s].
-_ALREADY_PASSING = 0.05
 
 
 class SafetyFilter(ActionFilter):
@@ -111,7 +107,10 @@ class SafetyFilter(ActionFilter):
         wrench, middle, wanted = wrench[rows], middle[rows], wanted[rows]
         target = wanted
         if self.barrier.settings.sidestep_speed > 0.0:
-            target = wanted + self._sidestep(rows, np.argmax(lack[rows], axis=1), planes, sensed)
+            at = rows, np.argmax(lack[rows], axis=1)
+            normal = np.stack([planes.x[at], planes.y[at]], axis=-1)
+            passing = np.stack([planes.speed_x[at], planes.speed_y[at]], axis=-1)
+            target = wanted + self.sidestep(self.barrier.settings, rows, normal, passing, sensed)
         torque, most = self._authority(wrench)
         axes = _body_axes(middle)
         slots = sensed.neighbour_mask.shape[1], sensed.obstacle_mask.shape[1]
@@ -145,39 +144,6 @@ class SafetyFilter(ActionFilter):
             torque = np.clip(torque, -largest, largest)
             most = np.minimum(most, 2.0 * (limit - np.abs(torque)[:, None] * per_torque))
         return torque, most / body.mass
-
-    def _sidestep(
-        self, rows: IntArray, worst: IntArray, planes: HalfPlanes, sensed: Sensed
-    ) -> FloatArray:
-        """Return what to add to the acceleration of agents that are blocked, (B, 2) [m/s^2].
-
-        Two agents that meet head-on, and an agent behind an obstacle, would wait for ever where the
-        filter leaves only the way back. An agent that does not get on, and whose goal lies behind
-        what it must not touch, is pushed along the rim until it passes at the sidestep's speed:
-        clockwise, or the way in which it already passes. Both agents of a pair find the same sense
-        of turning about each other.
-        """
-        kept = self.barrier.settings
-        x, y = planes.x[rows, worst], planes.y[rows, worst]
-        goal = sensed.goal[rows]
-        distance = np.sqrt(np.sum(goal * goal, axis=-1))
-        behind = -(x * goal[:, 0] + y * goal[:, 1]) > _FACING * distance
-        along = np.stack([y, -x], axis=-1)
-        passing = y * planes.speed_x[rows, worst] - x * planes.speed_y[rows, worst]
-        along = np.where((passing < -_ALREADY_PASSING)[:, None], -along, along)
-        lacking = np.maximum(
-            kept.sidestep_speed - np.sum(along * sensed.velocity[rows], axis=-1), 0.0
-        )
-        # Who has arrived stays.
-        progress = np.sum(sensed.velocity[rows] * goal, axis=-1)
-        blocked = (
-            behind
-            & (distance > self.settings.goal_radius)
-            & (progress < kept.blocked_speed * distance)
-        )
-        size = kept.sidestep_rate * blocked * lacking
-        push: FloatArray = size[:, None] * along
-        return push
 
 
 def _body_axes(heading: FloatArray) -> FloatArray:
