@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lagros_envs.arrays import BoolArray, Float32Array, FloatArray
+from lagros_envs.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_policies.policy import Policy
@@ -100,6 +100,7 @@ class ProvedFilter(ActionFilter):
         self, actions: NDArray[Any], sensed: Sensed, memory: FloatArray | None
     ) -> tuple[Float32Array, BoolArray, BoolArray, FloatArray | None]:
         reserve, gain = self.reserved.reserve, self.reserved.gain
+        sensed = without_empty_slots(sensed)
         nominal = self._nominal(sensed, memory)
         zones = self._zones(sensed, nominal)
         outside = self._outside(sensed, nominal, zones)
@@ -194,17 +195,6 @@ class ProvedFilter(ActionFilter):
         relative = np.where(moving, -sensed.neighbours[at][:, 2:], sensed.velocity[rows])
         push[rows] = self.sidestep(self._steps, rows, normal, relative, sensed)
         return push
-        slots, others = zones.x.shape[1], sensed.neighbour_mask.shape[1]
-        worst = np.argmax(lack[rows], axis=1) % slots
-        at = rows, np.minimum(worst, others - 1)
-        normal = np.stack([zones.x[rows, worst], zones.y[rows, worst]], axis=-1)
-        theirs = np.where(
-            (worst < others)[:, None], sensed.velocity[rows] + sensed.neighbours[at][:, 2:], 0.0
-        )
-        push[rows] = self.sidestep(
-            self._steps, rows, normal, sensed.velocity[rows] - theirs, sensed
-        )
-        return push
 
     def _outside(self, sensed: Sensed, nominal: Nominal, zones: Zones) -> BoolArray:
         """Return who can tell that the state is not in the set that is kept, shape (B,)."""
@@ -257,6 +247,22 @@ class ProvedFilter(ActionFilter):
         thrust = allocate(body, np.concatenate([force, torque[:, None]], axis=1))
         value: FloatArray = thrust / self.settings.thrust_scale
         return value
+
+
+def without_empty_slots(sensed: Sensed) -> Sensed:
+    """Return what is sensed without the slots that are empty for everybody, but the first."""
+
+    def used(mask: BoolArray) -> IntArray:
+        return np.flatnonzero(mask.any(axis=0) | (np.arange(mask.shape[1]) == 0))
+
+    others, discs = used(sensed.neighbour_mask), used(sensed.obstacle_mask)
+    return Sensed(
+        sensed.own,
+        sensed.neighbours[:, others],
+        sensed.neighbour_mask[:, others],
+        sensed.obstacles[:, discs],
+        sensed.obstacle_mask[:, discs],
+    )
 
 
 def nearest_beyond(wanted: FloatArray, normals: FloatArray, bounds: FloatArray) -> FloatArray:
