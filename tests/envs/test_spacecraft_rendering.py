@@ -203,3 +203,40 @@ def test_render_without_a_mode_warns_and_returns_none():
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="without a render mode"):
         assert env.render() is None
+
+
+def test_a_crowd_is_drawn_where_it_is_and_as_it_fares():
+    env = spacecraft_v0.parallel_env(80, "swarm", render_mode="rgb_array")
+    env.reset(seed=0)
+    world = env.episode.world
+    world.collision_time[0, 3] = 1.0
+    world.success_time[0, 4] = 1.0
+    frame = env.render()
+    ends = np.concatenate([[[0.0, 0.0]], [[env.preset.arena] * 2], world.goals[:, 0].T])
+    ends = np.concatenate([ends, world.parts[:2, 0].T])
+    low, high = ends.min(axis=0) - BORDER, ends.max(axis=0) + BORDER
+    side = np.max(high - low)
+    corner = 0.5 * (low + high) - 0.5 * side
+
+    def shown(agent):
+        column, row = (world.parts[:2, 0, agent] - corner) * VIEW / side
+        return frame[round(VIEW - row), round(column)].tolist()
+
+    assert shown(0) == list(BLUE)
+    assert shown(6) == list(BLUE)
+    assert shown(3) == list(VERMILLION)
+    assert pixels(frame, VERMILLION)[0].size > 20
+    env.close()
+
+
+def test_infos_of_a_crowd_are_each_agents_own():
+    env = spacecraft_v0.parallel_env(40, "swarm", disturbance="uniform")
+    _, infos = env.reset(seed=0)
+    *_, infos = env.step(dict.fromkeys(env.agents, STILL))
+    measures = env.episode.world.info()
+    for index, agent in enumerate(env.agents):
+        for name, value in infos[agent].items():
+            assert type(value) in (bool, float, np.ndarray)
+            np.testing.assert_array_equal(value, measures[name][0, index])
+    infos["agent_0"]["disturbance"][:] = 9.0
+    assert not np.any(infos["agent_1"]["disturbance"] == 9.0)
