@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import tomllib
 from pathlib import Path
@@ -46,7 +47,10 @@ html_theme = "furo"
 html_title = f"lagros {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_js_files = [("filter.js", {"defer": "defer"})]
+html_js_files: list[Any] = [("filter.js", {"defer": "defer"})]
+if os.environ.get("LAGROS_VERSIONED"):
+    # The first lies beside the folder of this version (docs/versions.py).
+    html_js_files += ["../../versions.js", "versions.js"]
 html_math_renderer = "mathml"
 html_copy_source = False
 html_theme_options: dict[str, Any] = {"navigation_with_keys": True}
