@@ -172,16 +172,11 @@ def _worst_cell(system: System, policy: str) -> str:
 
 
 def _worst_blocks(systems: Sequence[System], budget: int) -> Iterator[str]:
-    searches = [
-        row
-        for system in systems
-        for policy in system.policies
-        if (row := system.worst(policy, SUCCESS)) is not None
-    ]
-    if not searches:
+    systems = _searched(systems)
+    if not systems:
         return
-    episodes = " or ".join(
-        str(count) for count in dict.fromkeys(row["episodes"] for row in searches)
+    episodes = max(
+        row["episodes"] for name in systems[0].policies if (row := systems[0].worst(name, SUCCESS))
     )
     yield "## Worst found"
     yield (
@@ -240,17 +235,22 @@ def _ahead_words(systems: Sequence[System]) -> str:
         f"- of {', '.join(RIVALS)} together: {_ahead(systems, area, RIVALS)}",
         *(f"- of {rival} alone: {_ahead(systems, area, (rival,))}" for rival in RIVALS),
     ]
+    searched = _searched(systems)
     means = [
         f"{policy_label(policy)} {100.0 * np.mean(rates):.0f} %"
-        for policy in policies_of(systems)
-        if len(rates := _worst_rates(systems, policy)) == len(systems)
+        for policy in policies_of(searched)
+        if len(rates := _worst_rates(searched, policy)) == len(searched)
     ]
     if means:
-        told = (
-            f"Success under the worst disturbance found, mean over the systems: {', '.join(means)}."
-        )
+        names = ", ".join(system.task for system in searched)
+        told = f"Success under the worst disturbance found, mean of {names}: {', '.join(means)}."
         lines += ["", told]
     return "\n".join(lines)
+
+
+def _searched(systems: Sequence[System]) -> list[System]:
+    """Return the systems of which worst disturbances were searched."""
+    return [one for one in systems if any(one.worst(name, SUCCESS) for name in one.policies)]
 
 
 def _worst_rates(systems: Sequence[System], policy: str) -> list[float]:
@@ -325,7 +325,7 @@ def _system_blocks(system: System, result: dict[str, Any], page: Path) -> Iterat
     beside = result["settings"]["initial_error"]
     count = max(system.episodes)
     if count != result["settings"]["episodes"]:
-        yield f"Of an earlier run, with {count} episodes."
+        yield f"Of an earlier run, with {count} episodes and the weights of that time."
     yield (
         f"d̄ = {first['bound']:g} per second, units {units}. area: ∫‖x − x_d‖ dt of episodes that "
         f"begin on their plan; the next four columns: of those that begin beside it, by up to "
