@@ -93,7 +93,7 @@ def test_every_condition_is_there_and_what_is_missing_is_said(flown):
 def test_the_page_has_a_line_for_every_policy(flown):
     out, _ = flown
     text = (out / "all.md").read_text()
-    section = text.partition("## lone")[2]
+    section = text.partition("### lone")[2]
     lines = [line for line in section.splitlines() if line.startswith("|")]
     assert [line.split("|")[1].strip() for line in lines[2:]] == [
         "(b) tube-mpc",

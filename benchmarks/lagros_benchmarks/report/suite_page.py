@@ -78,14 +78,19 @@ def page_text(result: dict[str, Any], page: Path, figure: Path | None) -> str:
         blocks += _worst_blocks(systems, settings["worst_flights"])
         blocks += _proved_blocks(systems)
         blocks += _ahead_blocks(systems)
+    if systems:
+        blocks.append(
+            "## By system\n\narea: ∫‖x − x_d‖ dt of episodes that begin on their plan; normalised "
+            "area, peak, C and rate: of those that begin beside it, by up to "
+            f"{settings['initial_error']:g} of each scale. Δt: one call of the policy, the median."
+        )
     for system in systems:
         blocks += _system_blocks(system, result, page)
     for name in dict.fromkeys(row["task"] for row in rows if "agents" in row):
         blocks += _worlds_blocks([row for row in rows if row["task"] == name], page)
     made = result["machine"]
     blocks.append(
-        f"Flown on {made['processor'] or made['platform']}, worker processes: {settings['jobs']}. "
-        "Δt is that of one call of the policy, the median."
+        f"Flown on {made['processor'] or made['platform']}, worker processes: {settings['jobs']}."
     )
     return "\n\n".join(block for block in blocks if block) + "\n"
 
@@ -136,7 +141,7 @@ def _link(text: str, page: Path, place: str) -> str:
 
 def _heading(task: str, page: Path) -> str:
     place = f"{task}.md"
-    return f"## [{task}]({place})" if (page.parent / place).is_file() else f"## {task}"
+    return f"### [{task}]({place})" if (page.parent / place).is_file() else f"### {task}"
 
 
 def _pair(values: Sequence[str]) -> str:
@@ -322,15 +327,10 @@ def _system_blocks(system: System, result: dict[str, Any], page: Path) -> Iterat
     yield _heading(system.task, page)
     first = system.first
     units = (first.get("units") or {}).get("state") or "those of the state"
-    beside = result["settings"]["initial_error"]
     count = max(system.episodes)
-    if count != result["settings"]["episodes"]:
-        yield f"Of an earlier run, with {count} episodes and the weights of that time."
-    yield (
-        f"d̄ = {first['bound']:g} per second, units {units}. area: ∫‖x − x_d‖ dt of episodes that "
-        f"begin on their plan; the next four columns: of those that begin beside it, by up to "
-        f"{beside:g} of each scale."
-    )
+    earlier = count != result["settings"]["episodes"]
+    other = f" Of an earlier run: {count} episodes, the weights of that time." if earlier else ""
+    yield f"d̄ = {first['bound']:g} per second, units {units}.{other}"
     headings = [
         "policy",
         *(f"success, {kind} [%]" for kind in system.kinds),
