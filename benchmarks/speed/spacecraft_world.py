@@ -82,12 +82,12 @@ def by_turns(candidates: dict[Any, Callable[[], float]], rounds: int) -> dict[An
     return times
 
 
-def measure(sizes: str, preset: str, rounds: int) -> list[dict[str, Any]]:
+def measure(sizes: str, preset: str, rounds: int, plain: bool) -> list[dict[str, Any]]:
     """Return a row for each size and way of running it."""
     candidates: dict[Any, Callable[[], float]] = {}
     for size in sizes.split(","):
         worlds, agents = map(int, size.split("x"))
-        for compiled in (False, True) if has_numba() else (False,):
+        for compiled in (False, True) if has_numba() and not plain else (False,):
             candidates[worlds, agents, compiled] = stepping(worlds, agents, preset, compiled)
         candidates[worlds, agents, None] = drawing(agents, preset)
     rows = []
@@ -160,13 +160,14 @@ def main() -> None:
     parser.add_argument("--sizes", default=_SIZES, help="worlds x agents, with commas between")
     parser.add_argument("--preset", default="swarm", choices=sorted(PRESETS))
     parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--plain", action="store_true", help="without numba")
     parser.add_argument("--thresholds", action="store_true", help="cells beside all pairs")
     parser.add_argument("--json", type=Path)
     wanted = parser.parse_args()
     if wanted.thresholds:
         thresholds(wanted.preset, wanted.rounds)
         return
-    rows = measure(wanted.sizes, wanted.preset, wanted.rounds)
+    rows = measure(wanted.sizes, wanted.preset, wanted.rounds, wanted.plain)
     for row in rows:
         size = f"{row['worlds']:4} x {row['agents']:4}"
         if row["what"] == "scenario":
@@ -181,6 +182,7 @@ def main() -> None:
         command = (
             "OMP_NUM_THREADS=1 python benchmarks/speed/spacecraft_world.py "
             f"--sizes {wanted.sizes} --preset {wanted.preset} --rounds {wanted.rounds}"
+            f"{' --plain' if wanted.plain else ''}"
         )
         record = {"command": command, "load": os.getloadavg()[0], "rows": rows}
         write_atomic(wanted.json, json.dumps(record, indent=1) + "\n")
