@@ -309,7 +309,7 @@ def table(submissions: Iterable[Submission]) -> str:
     text = []
     for task in dict.fromkeys(name for name in task_names() if name in {one[0] for one in lines}):
         described = task_named(task)
-        text.append(f"### {described.title}, d̄ = {described.defaults.bound:g}\n")
+        text.append(f"## {described.title}, d̄ = {described.defaults.bound:g}\n")
         text.append(f"| {' | '.join(_HEADINGS)} |")
         text.append("| --- | --- | --- |" + " ---: |" * (len(_HEADINGS) - 4) + " --- |")
         ranked = sorted((one for one in lines if one[0] == task), key=lambda one: one[1])
