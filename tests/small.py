@@ -101,6 +101,8 @@ def small(words: tuple[str, ...]) -> tuple[str, ...] | None:
     more = SMALL[key]
     if "--replay" in rest:
         more = ("--quiet",)
+    elif "--from" in rest:  # the file says how much is flown
+        more = ("--quiet", "--jobs", "1")
     elif "--episodes 0" in " ".join(rest):
         more = ("--seconds", "5", "--quiet")
     elif "spacecraft" in (first, *rest) and key == "certify":

@@ -111,6 +111,8 @@ def test_what_a_page_says_runs(page: Path, tmp_path: Path) -> None:
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     if name(page) in PREPARED:
         run("python", "-c", _HEAD + PREPARED[name(page)])
+    # A page may speak of the modules that the README shows.
+    first_half.write_modules((ROOT / "README.md").read_text(encoding="utf-8"), tmp_path)
     first_half.write_modules(text, tmp_path)
     # What is typed above the first snippet comes first; it may make what the snippet reads.
     above = len(text.partition("```python\n")[0].splitlines())

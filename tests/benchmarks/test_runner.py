@@ -144,7 +144,7 @@ def test_progress_is_told_of_every_chunk():
     SingleExperiment.set_up(settings_of("steady"), fakes.EASY).units(
         lambda *args: told.append(args)
     )
-    assert told == [("planning", 1, 3), ("planning", 2, 3), ("planning", 3, 3)]
+    assert told == [("planning", 0, 3), ("planning", 1, 3), ("planning", 2, 3), ("planning", 3, 3)]
 
 
 def test_what_cannot_be_built_is_named_once():
