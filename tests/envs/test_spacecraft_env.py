@@ -80,7 +80,10 @@ def test_pettingzoo_finds_that_every_mode_draws(monkeypatch):
 @UNBOUNDED
 @pytest.mark.parametrize("preset", PRESETS)
 def test_gymnasium_checks_the_single_environment_without_another_warning(preset):
-    check_env(single(preset=preset, disturbance="uniform"), skip_render_check=True)
+    # Gymnasium ends an episode of this id after 45 s unless told otherwise; gcbf takes longer.
+    steps = spacecraft_v0.parallel_env(preset=preset).unwrapped.settings.steps
+    env = single(preset=preset, disturbance="uniform", max_episode_steps=steps)
+    check_env(env, skip_render_check=True)
 
 
 # Spaces and names.
