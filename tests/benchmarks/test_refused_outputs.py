@@ -29,7 +29,10 @@ WORK = (
     "lagros_benchmarks.run.demonstrations.demonstrate",
     "lagros_benchmarks.run.suite.fly_task",
     "lagros_policies.inspection.inspect_task",
+    "lagros_benchmarks.report.leaderboard.table",
 )
+BOARD = Path(__file__).resolve().parents[2] / "benchmarks" / "leaderboard"
+SUBMISSION = next(BOARD.glob("*.json"))
 START = {
     "bench": "bench spacecraft --policies learned --episodes 1",
     "reproduce": "reproduce cartpole",
@@ -41,6 +44,7 @@ START = {
     "watch": "watch cartpole --policy lqr",
     "suite": "suite cartpole",
     "check": "check cartpole",
+    "leaderboard": f"leaderboard {SUBMISSION}",
 }
 # Every option that takes a path: the suffix of the file that it writes, "" for a folder, and None
 # for what is read.
@@ -76,6 +80,8 @@ PATHS = {
     ("suite", "--figure"): ".png",
     ("suite", "--out"): "",
     ("suite", "--from"): None,
+    ("leaderboard", "--files"): None,  # is tried in test_leaderboard.py
+    ("leaderboard", "--markdown"): ".md",
 }
 WRITTEN = [(*key, suffix) for key, suffix in PATHS.items() if suffix is not None]
 FILES = [(command, option, suffix) for command, option, suffix in WRITTEN if suffix]

@@ -38,6 +38,7 @@ from lagros_benchmarks.worst_case.single import (
 from lagros_envs.conventions import beyond_the_end
 from lagros_envs.seeding import EVALUATION, episode_seeds
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.baselines import LqrPolicy
 from lagros_policies.contraction import certified_tube
@@ -311,7 +312,12 @@ def _flown(**changed: Any) -> SpacecraftFlights:
 )
 def test_what_counts_as_broken_in_a_world(goal: str, changed: dict[str, Any], broken: bool) -> None:
     target: Any = SimpleNamespace(
-        seed=1, goal=goal, margin=0.5, environment=lambda *_: None, fly=lambda _: _flown(**changed)
+        seed=1,
+        goal=goal,
+        margin=0.5,
+        task=SpacecraftSettings(),
+        environment=lambda *_: None,
+        fly=lambda _: _flown(**changed),
     )
     assert replay_spacecraft(target, np.zeros((450, 2, 6))).broken is broken
 
