@@ -44,6 +44,8 @@ def test_the_readers_own_policy_has_the_success_that_is_said(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    # Other tests have modules of this name, which Python keeps.
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
     first_half.write_modules(TEXT)
     result = CliRunner().invoke(cli.app, ["bench", "cartpole", "--policies", "mine:Lean"])
     assert result.exit_code == 0
