@@ -34,7 +34,8 @@ def arguments(task, name):
     found = {}
     for kind in kind_of(task, name).__mro__:
         parameters = inspect.signature(kind).parameters.values()
-        passed_on = [one for one in parameters if one.kind is one.VAR_KEYWORD]
+        rest = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+        passed_on = [one for one in parameters if one.kind in rest]
         found |= dict.fromkeys(one.name for one in parameters if one not in passed_on)
         if not passed_on:
             break
