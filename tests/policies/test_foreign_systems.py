@@ -418,6 +418,7 @@ def spacecraft_calls(body: Any) -> Iterator[tuple[Callable[..., Any], Callable[[
         sliding.SlidingTracking: lambda f: f(body, axis, axis),
         gain_control.GainTracking: lambda f: f(body, gain, gain),
         gain_control.tracking_law: lambda f: f("gain", body, 0.1, 2.0, 0.3),
+        world_tube.thrust_rounding: lambda f: f(body, np.ones(2), 0.1),
         world_tube.world_tube: lambda f: f(body, gain, gain, planned, 0.2, 3),
         proof_spacecraft.control_square: lambda f: f(body),
         proof_spacecraft.prove_spacecraft: lambda f: f(plane, None, body),

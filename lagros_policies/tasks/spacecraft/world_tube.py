@@ -210,6 +210,7 @@ def thrust_rounding(
     body: Spacecraft, push: FloatArray, turn: float
 ) -> tuple[FloatArray, FloatArray]:
     """Bound what single precision of the eight forces does to the accelerations, both (n,)."""
+    check_spacecraft(body, "thrust_rounding")
     torque = 2.0 * body.inertia * turn
     arms = body.arm + body.side_arm
     # |u| summed over the thrusters: forces along two axes, and a torque by four levers.
