@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from lagros_benchmarks.report.canvas import canvas, styles
 from lagros_benchmarks.report.formats import markdown_table
 from lagros_benchmarks.tasks.spacecraft.claims import tracked_with_a_gain
 from lagros_benchmarks.tasks.spacecraft.episodes import WorldsLoop, fly, make_filter, make_worlds
@@ -132,37 +133,60 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     return markdown_table(heads, lines)
 
 
+def series(row: dict[str, Any]) -> tuple[str, bool]:
+    """Return the name of the policy that a row flies, and whether it flies behind the filter."""
+    law = row.get("law", "gain")
+    if law == "lqr":
+        return "lqr-plan", row["safety_filter"]
+    return row["policy"] + ("" if law == "gain" else f":{law}"), row["safety_filter"]
+
+
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Draw strict success against the effort over the same time, a line for each law."""
-    import matplotlib.pyplot as plt
-    from matplotlib.ticker import NullFormatter
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     bounds = sorted({row["bound"] for row in rows})
-    lines = sorted({(row["policy"], row.get("law", ""), row["safety_filter"]) for row in rows})
-    figure, axes = plt.subplots(1, len(bounds), figsize=(4.2 * len(bounds), 3.6), squeeze=False)
-    for axis, bound in zip(axes[0], bounds, strict=True):
-        for colour, (policy, law, filtered) in enumerate(lines):
+    lines = sorted({series(row) for row in rows})
+    look = styles([name for name, _ in lines])
+    figure, panels = canvas(
+        4.6 * len(bounds), 4.0, columns=len(bounds), share="all", abscissa=False
+    )
+    for axes, bound in zip(panels, bounds, strict=True):
+        for name, filtered in lines:
             line = [
-                row
-                for row in rows
-                if (row["policy"], row.get("law", ""), row["safety_filter"], row["bound"])
-                == (policy, law, filtered, bound)
+                row for row in rows if series(row) == (name, filtered) and row["bound"] == bound
             ]
-            if not line:
-                continue
             line.sort(key=lambda row: row.get("contraction_rate", 0.0))
             points = [(row["effort_total_mean"], 100 * row["strict_success_rate"]) for row in line]
-            name = " ".join(part for part in (policy, law, "+ filter" if filtered else "") if part)
-            axis.plot(*zip(*points, strict=True), "o-", color=f"C{colour}", label=name)
+            style = look[name]
+            axes.plot(
+                [effort for effort, _ in points],
+                [success for _, success in points],
+                color=style.colour,
+                linestyle=style.line,
+                marker=style.marker,
+                markerfacecolor="white" if filtered else style.colour,
+                label=name + (" with the filter" if filtered else ""),
+            )
             for point, row in zip(points, line, strict=True):
-                if law == "gain":
-                    axis.annotate(f"{row['contraction_rate']:g}", point, fontsize=7)
-        axis.set(title=f"d̄ = {bound:g}", xlabel="∫‖u‖² to 45 s [N²s]", xscale="log")
-        axis.xaxis.set_minor_formatter(NullFormatter())
-    axes[0, 0].set_ylabel("strict success [%]")
-    axes[0, -1].legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(path, dpi=150)
+                if "contraction_rate" in row:
+                    axes.annotate(
+                        f"{row['contraction_rate']:g}",
+                        point,
+                        (0, -11),
+                        textcoords="offset points",
+                        ha="center",
+                        fontsize=7,
+                        color=style.colour,
+                    )
+        axes.set(title=f"d̄ = {bound:g}", xlabel="effort ∫‖u‖² dt to 45 s [N²s]", xscale="log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+    panels[0].margins(y=0.12)
+    panels[0].set_ylabel("strict success [%]")
+    panels[0].legend(fontsize=7, loc="lower right", title="numbers: α [1/s]", title_fontsize=7)
+    figure.savefig(path)
 
 
 def _key(row: dict[str, Any]) -> tuple[Any, ...]:
