@@ -131,7 +131,9 @@ def test_gains_of_many_loops_are_those_of_scipy_and_one_without_spoils_no_other(
     for f, g, gain in zip(transition[3:], effect[3:], gains[3:], strict=True):
         cost = scipy.linalg.solve_discrete_are(f, g, state, control)
         wanted = np.linalg.solve(control + g.T @ cost @ g, g.T @ cost @ f)
-        np.testing.assert_allclose(gain, wanted, rtol=1e-6, atol=1e-7 * np.abs(wanted).max())
+        # SciPy's own error: up to 4e-7 of the largest entry, against 40 digits, where the condition
+        # of the cost comes to 1e9.
+        np.testing.assert_allclose(gain, wanted, rtol=0.0, atol=1e-5 * np.abs(wanted).max())
 
 
 def test_the_weights_decide():
