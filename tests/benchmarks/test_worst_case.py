@@ -143,6 +143,14 @@ def test_methods_near_the_optimum_that_is_known(method: str) -> None:
     assert np.linalg.norm(sequences, axis=-1).max() <= 1.0
 
 
+def test_a_climb_of_few_where_the_budget_does_not_pay_for_all() -> None:
+    target = LinearTarget(np.random.default_rng(2).standard_normal((3, 9, 3)), slope_cost=16)
+    # One start, sixty flights that explore; eight climbers would cost 160 a round.
+    found = search(target, SearchSettings(budget=130))
+    assert {one.flights for one in found} <= set(range(81, 131))
+    np.testing.assert_allclose([one.score for one in found], target.best)
+
+
 @pytest.mark.parametrize("name", OPTIMISERS)
 def test_optimisers_are_reproducible_and_learn(name: str) -> None:
     def best(seed: int) -> FloatArray:

@@ -28,6 +28,8 @@ _WAYS = (1.0, 0.5, 0.2, 0.05)
 _START_NOISE = 0.3
 # Share of the budget at which "hybrid" stops to explore and climbs.
 _EXPLORED = 0.5
+# Where the rest does not pay for one round of all, so few climb that it pays for as many.
+_ROUNDS = 3
 
 
 class Target(Protocol):
@@ -70,7 +72,7 @@ class SearchSettings:
         pieces: Its pieces.
         budget: Flights per episode.
         population: Flights per question of an optimiser.
-        restarts: Sequences that climb side by side.
+        restarts: Sequences that climb side by side, fewer where the budget is small.
 
     Raises:
         ValueError: A name is unknown or a number is out of range.
@@ -226,9 +228,12 @@ def _climb(target: Target, pool: _Pool, budget: int) -> None:
     gradient), so that they never leave the balls.
     """
     ways = np.array(_WAYS)
+    price = target.slope_cost + len(ways)
+    rest = budget - pool.flights
+    climbers = pool.size if pool.size * price <= rest else max(1, rest // (_ROUNDS * price))
     while True:
-        count = min(len(values) for values in pool.scores)
-        cost = count * (target.slope_cost + len(ways))
+        count = min(climbers, *(len(values) for values in pool.scores))
+        cost = count * price
         if count == 0 or pool.flights + cost > budget:
             return
         before = np.stack([values[:count] for values in pool.scores])
@@ -254,6 +259,6 @@ def _climb(target: Target, pool: _Pool, budget: int) -> None:
                 gained[index], each[index, np.arange(count), best[index]], before[index]
             )
             order = np.argsort(-values, kind="stable")
-            pool.sequences[index], pool.scores[index] = kept[order], values[order]
+            pool.sequences[index][:count], pool.scores[index][:count] = kept[order], values[order]
         if not gained.any():
             return
