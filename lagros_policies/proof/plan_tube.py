@@ -11,7 +11,7 @@ action in single precision, and the rounding of all floats, also of those of the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,6 +71,7 @@ def plan_tubes(
     control_centre: ArrayLike = 0.0,
     channels: Sequence[bool] | None = None,
     initial: ArrayLike | None = None,
+    tell: Callable[[int, int], None] | None = None,
 ) -> PlanTubes:
     """Bound the errors of a law along plans for every disturbance with ||d|| <= d_bar.
 
@@ -89,6 +90,7 @@ def plan_tubes(
         channels: Which coordinates d moves; all if left out.
         initial: Bounds of |x(0) - x_d(0)|, shape (n,) or (p, n); what single precision rounds of
             x_d(0) if left out.
+        tell: Called with the number of holds that are done, and with that of all.
 
     Raises:
         ValueError: A shape is wrong, a number is not finite, or the bound is negative.
@@ -115,9 +117,16 @@ def plan_tubes(
     hold = HoldOfErrors(system, period, bound, mask, curved(system, period, states, controls))
     every = np.concatenate([np.eye(n), asked])
     found = []
-    for piece, law in zip(pieces, laws, strict=True):
+    for index, (piece, law) in enumerate(zip(pieces, laws, strict=True)):
         plan = states[piece], controls[piece]
-        known, outputs, norm, deviation = _along(hold, *plan, law, every, begin[piece], limits)
+
+        def told(step: int, before: int = index * steps) -> None:
+            if tell is not None:
+                tell(before + step, len(pieces) * steps)
+
+        known, outputs, norm, deviation = _along(
+            hold, *plan, law, every, begin[piece], limits, told
+        )
         between = errors_between(
             system,
             period,
@@ -143,6 +152,7 @@ def _along(
     directions: FloatArray,
     initial: FloatArray,
     limits: tuple[FloatArray, FloatArray],
+    told: Callable[[int], None],
 ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
     """Return which tubes close, and bounds along directions, of the norm and of u - u_d."""
     plans, steps, m = controls.shape
@@ -153,6 +163,7 @@ def _along(
     errors = boxed(initial, int(hold.channels.sum()))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for step in range(steps + 1):
+            told(step)
             outputs[known, step] = errors.bound(asked)[known]
             norm[known, step] = errors.norm()[known]
             if step == steps:

@@ -65,7 +65,7 @@ def linear_loop(task, weights, count=3, flown=1.0, shrunk=1.0):
         change = np.einsum("bmn,bn->bm", flown * gains[episode, step], error)
         return applied(task, task.action(episodes.controls[episode, step] + change))
 
-    def tubes(bound):
+    def tubes(bound, tell=None):
         found = plan_tubes(
             task.system,
             task.control_period,

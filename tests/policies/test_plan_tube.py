@@ -257,6 +257,15 @@ def test_where_a_tube_does_not_close_the_others_do():
     np.testing.assert_allclose(found.outputs[0], found.outputs[2], rtol=1e-9)
 
 
+def test_of_more_plans_than_fit_together_all_holds_are_told():
+    system, plan, gains, bound = loop("pole", steps=3)
+    heard = []
+    many = (np.stack([part] * 65) for part in (*plan, gains))
+    plan_tubes(system, PERIOD, *many, bound, tell=lambda done, of: heard.append((done, of)))
+    # The last of the first pieces is the first of the next.
+    assert heard == [(done, 6) for done in (0, 1, 2, 3, 3, 4, 5, 6)]
+
+
 def test_what_limits_take_of_the_control_counts():
     system, plan, gains, bound = loop("pole", 15)
     rng = np.random.default_rng(6)

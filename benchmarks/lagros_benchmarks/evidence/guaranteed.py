@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -158,10 +159,12 @@ def errors_of(flights: Flights, plans: FloatArray) -> FloatArray:
     return np.where(flights.alive, error, 0.0)
 
 
-def _proved(loop: Loop, bound: float) -> tuple[PlanTubes, Guarantees] | None:
+def _proved(
+    loop: Loop, bound: float, tell: Callable[[int, int], None] | None = None
+) -> tuple[PlanTubes, Guarantees] | None:
     if loop.tubes is None:
         return None
-    flown, tubes = loop.episodes, loop.tubes(bound)
+    flown, tubes = loop.episodes, loop.tubes(bound, tell)
     found = guarantees(flown.settings, flown.goals, flown.discs, flown.plans, flown.controls, tubes)
     return tubes, found
 
@@ -205,9 +208,7 @@ def evidence_of(
     """
     watch = Stopwatch()
     flown = loop.episodes
-    tell("proof", 0, 1)
-    tubes, proved = _proved(loop, bound) or (None, None)
-    tell("proof", 1, 1)
+    tubes, proved = _proved(loop, bound, partial(tell, "proof")) or (None, None)
     smaller = None
     if proved is not None and not proved.holds.any():
         smaller = _smaller(loop, bound, most_seconds, tell)

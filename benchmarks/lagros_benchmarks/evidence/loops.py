@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
@@ -32,6 +32,15 @@ from lagros_policies.proof.plan_tube import PlanTubes, plan_tubes
 from lagros_policies.proof.steering import Controller
 
 
+class TubesOf(Protocol):
+    """From d_bar, and what is called with the holds done and all, to the tubes of motions."""
+
+    def __call__(
+        self, bound: float, tell: Callable[[int, int], None] | None = None, /
+    ) -> PlanTubes:
+        """Return the tubes."""
+
+
 @dataclass(frozen=True)
 class Loop:
     """A policy around its undisturbed motions.
@@ -45,7 +54,7 @@ class Loop:
 
     episodes: Episodes
     law: Law
-    tubes: Callable[[float], PlanTubes] | None
+    tubes: TubesOf | None
     why: str = ""
 
 
@@ -115,7 +124,12 @@ def shown(scenario: Scenario) -> Scenario:
     )
 
 
-def _tubes(episodes: Episodes, law: FloatArray | Controller, bound: float) -> PlanTubes:
+def _tubes(
+    episodes: Episodes,
+    law: FloatArray | Controller,
+    bound: float,
+    tell: Callable[[int, int], None] | None = None,
+) -> PlanTubes:
     task = episodes.settings
     return plan_tubes(
         task.system,
@@ -128,6 +142,7 @@ def _tubes(episodes: Episodes, law: FloatArray | Controller, bound: float) -> Pl
         control_low=np.array(task.control_low),
         control_high=np.array(task.control_high),
         control_centre=np.array(task.control_centre),
+        tell=tell,
     )
 
 
