@@ -21,6 +21,8 @@ Number = Union["Interval", FloatArray, float]
 # and is no subnormal number, which would slow every product down.
 _ULP = 2.0**-52
 _TINY = 1e-300
+# What rounding outwards may leave of a sum of squares below zero.
+_BELOW = 1e-290
 # NumPy's sine and cosine are taken to err by 4 units in the last place at most, 4.5e-16 up to one.
 _SINE_ERROR = 2e-15
 # The same for its tangent and exponential, relative to the value.
@@ -181,14 +183,14 @@ class Interval:
         return ordered(np.maximum(value.lower, 0.0), value.upper)
 
     def sqrt(self) -> Interval:
-        """Enclose the square roots.
+        """Enclose the square roots; of what rounding alone put below zero, those from zero on.
 
         Raises:
             ValueError: An interval holds negative numbers.
         """
-        if np.any(self.lower < 0.0):
+        if np.any(self.lower < -_BELOW):
             raise ValueError("an interval under a square root holds negative numbers")
-        least = np.maximum(_down(np.sqrt(self.lower)), 0.0)
+        least = np.maximum(_down(np.sqrt(np.maximum(self.lower, 0.0))), 0.0)
         return ordered(least, _up(np.sqrt(self.upper)))
 
     def sign(self) -> Interval:

@@ -185,6 +185,9 @@ def test_poles_and_roots_of_negative_intervals_are_refused():
         Interval(-1.6, -1.5).tan()
     with pytest.raises(ValueError, match="negative"):
         Interval(-0.1, 2.0).sqrt()
+    # A sum of squares around zero holds no negative number, but for rounding.
+    around = Interval(-0.1, 0.2)
+    assert (around * around + around * around).sqrt().contains(np.array([0.0, 0.2 * 2**0.5])).all()
     assert Interval(1.5, 1.57).tan().upper > 1255.0
 
 

@@ -12,8 +12,10 @@ from lagros_envs.dynamics import hold_step
 from lagros_envs.numbers import Interval, functions
 from lagros_envs.sweep import closest_approach
 from lagros_envs.task import Scenario, Task
+from lagros_envs.tasks.arm.task import ArmSettings
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
 from lagros_envs.tasks.pvtol.task import PvtolSettings
+from lagros_envs.tasks.quadrotor.task import HeadingQuadrotorSettings
 from lagros_policies.planning.planner import planner_of
 from lagros_policies.proof.guarantee import guarantees, nominal_between
 
@@ -102,6 +104,23 @@ def test_small_tubes_are_guaranteed_and_large_ones_not(case):
     found = guarantees(task, goals, discs, states, controls, large)
     assert not found.upright.any()
     assert not found.reaches.any()
+
+
+@pytest.mark.parametrize(
+    "task", [ArmSettings(), PvtolSettings(), HeadingQuadrotorSettings()], ids=lambda t: t.name
+)
+def test_the_distance_from_the_goal_is_bounded_closely_by_the_tasks_own_rule(task):
+    # Around a goal the sum of squares under the root begins at zero.
+    goals, discs, states, controls = planned(task, 2)
+    box = np.full((2, task.system.state_dim), 0.01)
+    # Wide where the distance does not look.
+    box[:, -1] = 5.0 if task.name == "pvtol" else 0.01
+    found = guarantees(task, goals, discs, states, controls, tubes_of(task, states, box))
+    signs = np.sign(np.random.default_rng(1).uniform(-1.0, 1.0, (400, *box.shape)))
+    ends = np.moveaxis(states[:, -1] + signs * box, -1, 0)
+    flown = task.goal_distance(list(ends), list(goals.T), functions).max(axis=0)
+    assert np.all(flown <= found.goal_distance)
+    assert np.all(found.goal_distance <= 1.1 * flown)
 
 
 def test_what_has_no_tube_has_no_guarantee_and_no_finite_bound(case):
