@@ -242,6 +242,8 @@ def test_ahead_is_a_whole_interval_below_one_under_every_kind_and_of_every_rival
     rows[-1] = made_up("tube-mpc", "constant", 0.2, ratios | {"c3m": 0.92})
     assert System(rows).ahead(MEASURES[0], "tube-mpc", "c3m") is True
     assert System(rows).ahead(MEASURES[1], "tube-mpc", "c3m") is False
+    assert System(rows).ahead(MEASURES[1], "tube-mpc", "c3m", "uniform") is True
+    assert System(rows).ahead(MEASURES[1], "tube-mpc", "c3m", "constant") is False
     best = [made_up("lagros", *key, {**ratios, "sd-lqr": 0.5}) for key in _keys()]
     settings = {"episodes": 9, "fewer": {}, "disturbances": ["uniform", "constant"], "jobs": 1}
     settings |= {"worst_flights": 20}

@@ -207,16 +207,17 @@ def _proved_blocks(systems: Sequence[System]) -> Iterator[str]:
     yield "## Proved [%]"
     yield (
         "Share of plans of which it is *proved*, over every disturbance within d̄, that the flight "
-        "succeeds and breaks no rule of its task. A dash: it was not tried."
+        "succeeds and breaks no rule of its task. A dash: no proof of ours is about that loop, as of "
+        "a network that sees discs from where its body is."
     )
     yield markdown_table(["system", "plans", *map(policy_label, OURS)], rows)
 
 
-def _ahead(systems: Sequence[System], measure: Measure, rivals: Sequence[str]) -> str:
-    """Say on which systems one of ours is ahead of all of some rivals."""
+def _ahead(systems: Sequence[System], measure: Measure, rivals: Sequence[str], *kinds: str) -> str:
+    """Say on which systems one of ours is ahead of all of some rivals, under all kinds or some."""
     ahead, behind, unknown = [], [], []
     for system in systems:
-        verdicts = [[system.ahead(measure, our, one) for one in rivals] for our in OURS]
+        verdicts = [[system.ahead(measure, our, one, *kinds) for one in rivals] for our in OURS]
         if any(all(verdict is True for verdict in one) for one in verdicts):
             ahead.append(system.task)
         elif any(None in one for one in verdicts):
@@ -231,13 +232,14 @@ def _ahead(systems: Sequence[System], measure: Measure, rivals: Sequence[str]) -
 
 def _ahead_words(systems: Sequence[System]) -> str:
     """Say at once on how many systems one of ours is ahead, and on which not."""
-    area = MEASURES[0]
+    area, kinds = MEASURES[0], systems[0].kinds
     lines = [
         "Is the contraction law (b), or its network (c), ahead in the area under the error? "
         "*Ahead* is: the whole interval of the paired median ratio below 1, under every kind of "
         "disturbance.",
         "",
         f"- of {', '.join(RIVALS)} together: {_ahead(systems, area, RIVALS)}",
+        *(f"- the same under {k} alone: {_ahead(systems, area, RIVALS, k)}" for k in kinds),
         *(f"- of {rival} alone: {_ahead(systems, area, (rival,))}" for rival in RIVALS),
     ]
     searched = _searched(systems)

@@ -83,9 +83,9 @@ class System:
             return None
         return versus[measure.ratio], versus[f"{measure.ratio}_ci95"]
 
-    def ahead(self, measure: Measure, ours: str, rival: str) -> bool | None:
-        """Return whether the whole interval is below 1 under every kind; None without a rival."""
-        found = [self.ratio(measure, ours, rival, kind) for kind in self.kinds]
+    def ahead(self, measure: Measure, ours: str, rival: str, *kinds: str) -> bool | None:
+        """Return whether the whole interval is below 1 under all kinds; None without a rival."""
+        found = [self.ratio(measure, ours, rival, kind) for kind in kinds or self.kinds]
         if any(one is None for one in found):
             return None
         return all(one[1] is not None and one[1][1] < 1.0 for one in found)
