@@ -207,8 +207,8 @@ def _proved_blocks(systems: Sequence[System]) -> Iterator[str]:
     yield "## Proved [%]"
     yield (
         "Share of plans of which it is *proved*, over every disturbance within d̄, that the flight "
-        "succeeds and breaks no rule of its task. A dash: no proof of ours is about that loop, as of "
-        "a network that sees discs from where its body is."
+        "succeeds and breaks no rule of its task. A dash: no proof of ours is about that loop, as "
+        "of a network that sees discs from where its body is."
     )
     yield markdown_table(["system", "plans", *map(policy_label, OURS)], rows)
 
