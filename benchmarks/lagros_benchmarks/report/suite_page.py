@@ -215,18 +215,15 @@ def _proved_blocks(systems: Sequence[System]) -> Iterator[str]:
 
 def _ahead(systems: Sequence[System], measure: Measure, rivals: Sequence[str], *kinds: str) -> str:
     """Say on which systems one of ours is ahead of all of some rivals, under all kinds or some."""
-    ahead, behind, unknown = [], [], []
+    ahead, unknown = [], []
     for system in systems:
         verdicts = [[system.ahead(measure, our, one, *kinds) for one in rivals] for our in OURS]
         if any(all(verdict is True for verdict in one) for one in verdicts):
             ahead.append(system.task)
         elif any(None in one for one in verdicts):
             unknown.append(system.task)
-        else:
-            behind.append(system.task)
     line = f"on {len(ahead)} of {len(systems)}"
     line += f" ({', '.join(ahead)})" if ahead else ""
-    line += f"; not on {', '.join(behind)}" if behind else ""
     return line + (f"; not all of them flew {', '.join(unknown)}" if unknown else "")
 
 
