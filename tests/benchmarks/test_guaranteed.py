@@ -134,6 +134,12 @@ def test_what_is_not_known_between_the_instants_is_not_claimed(cartpole_evidence
     assert "instants alone: " in least
     assert "by coordinate" not in least
     assert not any("inf" in one for one in (said, less, least))
+    state = np.full_like(found.proved.state, np.inf)
+    blind = replace(none, proved=replace(none.proved, state=state))
+    assert "reaches the goal, ‖x − x_d‖ ≤ " in words.headline(SHORT, loop, blind, 0.1)
+    record = json.loads(json.dumps(guaranteed.as_json(blind, SHORT), allow_nan=False))
+    assert set(record["state_bounds"].values()) == {None}
+    assert record["norm_bound"] > 0.0
 
 
 @pytest.mark.parametrize("flown", [-1.0, 0.4, 2.5])
@@ -215,6 +221,10 @@ def test_every_law_that_is_a_gain_along_a_plan_is_spoken_of(policy):
         ("tube-mpc", "cartpole", 0.25),
         ("tube-mpc", "pvtol", 0.05),
         ("tube-mpc", "car", 0.1),
+        ("tube-mpc", "car", 0.3),
+        ("tube-mpc", "quadrotor", 0.2),
+        ("tube-mpc", "arm", 0.3),
+        ("lagros", "arm", 0.05),
         ("lagros", "cartpole", 0.001),
         ("lagros", "cartpole", 0.05),
     ],

@@ -251,9 +251,12 @@ def as_json(evidence: Evidence, task: Task) -> dict[str, Any] | None:
     kept, shares = proved.holds, evidence.shares
     some = bool(kept.any())
 
-    def largest(values: FloatArray) -> dict[str, float] | None:
-        ends = values[kept].max(axis=0) if some else None
-        return None if ends is None else dict(zip(names, ends.tolist(), strict=True))
+    def largest(values: FloatArray) -> dict[str, float | None] | None:
+        if not some:
+            return None
+        # Of a motion that is not enclosed between the instants nothing is known there.
+        ends = [end if np.isfinite(end) else None for end in values[kept].max(axis=0).tolist()]
+        return dict(zip(names, ends, strict=True))
 
     return {
         "episodes": evidence.asked,

@@ -114,7 +114,8 @@ def _bounds(task: Task, found: Evidence) -> list[str]:
         f"|{name}| ≤ {at_most(float(size), _DIGITS)} {unit}".strip()
         for name, size, unit in zip(coordinates(task), state, units, strict=True)
     ]
-    watched = watched_coordinates(task)
+    # Where a motion between the instants is not enclosed, nothing is said of it.
+    watched = [index for index in watched_coordinates(task) if np.isfinite(state[index])]
     if watched:
         return [bounds[index] for index in watched]
     norm = at_most(float(found.proved.norm[kept].max()), _DIGITS)
