@@ -99,6 +99,20 @@ def join(parts: Sequence[SetSamples]) -> SetSamples:
     )
 
 
+def only(samples: SetSamples, chosen: NDArray[np.bool_]) -> SetSamples:
+    """Return those samples that are chosen, shape (s,)."""
+    place = np.cumsum(chosen) - 1
+
+    def kept(elements: Elements) -> Elements:
+        rows = chosen[elements.owner]
+        owner = place[elements.owner[rows]]
+        return Elements(elements.values[rows], owner, elements.weight[rows])
+
+    own, neighbours, obstacles, frame = samples.features
+    features = SetFeatures(own[chosen], kept(neighbours), kept(obstacles), frame[chosen])
+    return SetSamples(features, samples.target[chosen], samples.world[chosen])
+
+
 def _join_elements(parts: Sequence[Elements], offsets: IntArray) -> Elements:
     return Elements(
         np.concatenate([part.values for part in parts]),

@@ -24,6 +24,7 @@ from lagros_policies.learning.train import TrainingSettings
 from lagros_policies.learning.train_deep_set import DeepSetTraining
 from lagros_policies.room import PRETRAINED
 from lagros_policies.tasks.cartpole.metric_design import MetricDesignSettings
+from lagros_policies.tasks.spacecraft.crowds import CrowdSettings
 from lagros_policies.tasks.spacecraft.flights import FlightData, FlightSettings
 from lagros_policies.tasks.spacecraft.station import StationSettings
 
@@ -187,8 +188,22 @@ def small_spacecraft():
         station=StationSettings(
             flights=FlightSettings(worlds=2, worlds_per_shard=1, agents=(2,), seed=3)
         ),
+        kept=StationSettings(
+            flights=FlightSettings(worlds=2, worlds_per_shard=1, agents=(2,), seed=4)
+        ),
+        crowds=tuple(
+            (
+                CrowdSettings(
+                    FlightSettings(
+                        worlds=2, worlds_per_shard=1, agents=(2,), preset=preset, seed=seed
+                    )
+                ),
+            )
+            for preset, seed in (("swarm-45", 5), ("gcbf", 6))
+        ),
         held_out=0.5,
         intermediate=training,
+        station_training=training,
         lagros=training,
         learned=training,
         worlds=1,

@@ -39,8 +39,9 @@ from lagros_policies.tasks.spacecraft.setup import (
 )
 from lagros_policies.tasks.spacecraft.wrench_control import AxesTracking
 
-# Time from node to node of a plan [s].
-_NODE_PERIOD = 0.5
+# Time from node to node of a plan [s], and up to how many nodes of it. Longer plans, of worlds of
+# many, have steps of twice, three times ... that, and are rounded down to whole ones.
+_NODE_PERIOD, _MOST_NODES = 0.5, 90
 # Where no plan keeps the margin these shares of it are tried in turn.
 _SHARES = (1.0, 0.75, 0.5, 0.25)
 # Leave tight starts at this acceleration [m/s^2]. With it and `PAIR_SHARE`, at d_bar = 1 in 60
@@ -69,17 +70,20 @@ def planner_settings(
             of the state per second.
 
     Raises:
-        ValueError: The horizon is not a whole number of node steps of 0.5 s, one of those is not a
-            whole number of control periods, or the thrust limit leaves no force for plans.
+        ValueError: The horizon, up to 45 s, is not a whole number of node steps of 0.5 s, one of
+            those is not a whole number of control periods, or the thrust limit leaves no force for
+            plans.
     """
-    nodes = round(settings.horizon / _NODE_PERIOD)
-    if abs(nodes * _NODE_PERIOD - settings.horizon) > 1e-6:
+    steps = math.ceil(settings.horizon / (_MOST_NODES * _NODE_PERIOD) - 1e-9)
+    period = steps * _NODE_PERIOD
+    nodes = math.floor(settings.horizon / period + 1e-9)
+    if steps == 1 and abs(nodes * period - settings.horizon) > 1e-6:
         raise ValueError(
             f"horizon={settings.horizon!r} s must be a whole number of node steps of "
             f"{_NODE_PERIOD} s; or give a planner of your own"
         )
     return JointPlannerSettings(
-        horizon=settings.horizon,
+        horizon=nodes * period,
         nodes=nodes,
         control_period=settings.control_period,
         mass=settings.system.mass,

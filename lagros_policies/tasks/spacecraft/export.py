@@ -11,12 +11,7 @@ from lagros_envs.tasks.spacecraft.sensing import NEIGHBOUR_DIM, OBSTACLE_DIM
 from lagros_envs.tasks.spacecraft.task import THRUSTERS
 from lagros_policies.export.program import Bodies, Numbers, Part, Program, Vector
 from lagros_policies.export.source import Exported, Source
-from lagros_policies.tasks.spacecraft.features import (
-    NEIGHBOUR,
-    body_features,
-    own_features,
-    shown_goal,
-)
+from lagros_policies.tasks.spacecraft.features import NEIGHBOUR, body_features, own_features
 from lagros_policies.tasks.spacecraft.network_policy import SpacecraftNetworkPolicy
 from lagros_policies.tasks.spacecraft.thrusters import allocation_matrix
 
@@ -44,8 +39,8 @@ def exported(policy: SpacecraftNetworkPolicy) -> Exported:
 
     def look(own: Numbers) -> tuple[Numbers, Numbers]:
         goal, velocity = Vector(*own[0:2]), Vector(*own[2:4])
-        shown, left = shown_goal(goal, settings.horizon - own[8], policy.receding)
-        features, ahead = own_features(shown, velocity, own[6], own[7], left)
+        left = settings.horizon - own[8]
+        features, ahead = own_features(goal, velocity, own[6], own[7], left, policy.receding)
         return features, [ahead.real, ahead.imag, *own[2:6]]
 
     def neighbour(seen: Numbers, context: Numbers) -> tuple[Numbers, object]:

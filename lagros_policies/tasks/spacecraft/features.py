@@ -49,7 +49,9 @@ NEAR = 0.3  # scale of nearness = exp(-gap / NEAR) [m]
 FADE = 0.4  # what is sensed counts in full this far inside the sensing radius [m]
 
 
-def own_features(goal: Any, velocity: Any, turn: Any, spin: Any, left: Any) -> tuple[Any, Any]:
+def own_features(
+    goal: Any, velocity: Any, turn: Any, spin: Any, left: Any, receding: Receding | None = None
+) -> tuple[Any, Any]:
     """Return `OWN` and the unit vector to the goal.
 
     Args:
@@ -58,13 +60,16 @@ def own_features(goal: Any, velocity: Any, turn: Any, spin: Any, left: Any) -> t
         turn: Of the heading since the start [rad].
         spin: [rad/s].
         left: Until the horizon [s].
+        receding: How far goals are shown; None for all the way.
     """
+    if receding is not None:
+        goal = receding.shown(goal)
     # A shift that no observation, in single precision, can undo: nothing is divided by zero.
     shifted = goal + SMALL
     distance = abs(shifted)
     frame = shifted / distance
     course = velocity * frame.conj()
-    time = time_to_go(distance, left)
+    time = time_to_go(distance, left) if receding is None else receding.time_to_go(distance)
     near, soon = minimum(distance, CLOSE), minimum(time, SOON)
     over = distance / (time + SOON)
     return (distance, near, course.real, course.imag, time, soon, over, turn, spin), frame
@@ -89,17 +94,6 @@ def body_features(apart: Any, motion: Any, touch: Any, rim: Any) -> tuple[Any, A
     return values, weight
 
 
-def shown_goal(goal: Any, left: Any, receding: Receding | None) -> tuple[Any, Any]:
-    """Return the goal that a network is shown, and the time that is left for it [s].
-
-    Args:
-        goal: Relative to the agent, a vector [m].
-        left: Until the horizon [s].
-        receding: How far goals are shown; None for all the way.
-    """
-    return (goal, left) if receding is None else receding.shown(goal)
-
-
 def spacecraft_features(
     sensed: Sensed,
     settings: SpacecraftSettings,
@@ -114,11 +108,12 @@ def spacecraft_features(
         settings: The task.
         agent_radius: Radius of every agent against the others [m].
         core_radius: Radius against obstacles [m].
-        receding: As for `shown_goal`.
+        receding: As for `own_features`.
     """
     course, left = _complex(sensed.velocity), settings.horizon - sensed.time
-    goal, left = shown_goal(_complex(sensed.goal), left, receding)
-    own, frame = own_features(goal, course, sensed.heading_change, sensed.spin, left)
+    own, frame = own_features(
+        _complex(sensed.goal), course, sensed.heading_change, sensed.spin, left, receding
+    )
     back = frame.conj()
     # Neighbours first, then obstacles: one table for both.
     whose, slot = sensed.neighbour_mask.nonzero()

@@ -37,6 +37,7 @@ from lagros_policies.learning.train_deep_set import SetSamples
 from lagros_policies.tasks.spacecraft.expert import SpacecraftExpert, SpacecraftExpertSettings
 from lagros_policies.tasks.spacecraft.features import spacecraft_features
 from lagros_policies.tasks.spacecraft.network_policy import SpacecraftNetworkPolicy
+from lagros_policies.tasks.spacecraft.receding import Receding
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 
 
@@ -240,7 +241,11 @@ def make_shard(
 
 
 def flight_samples(
-    data: FlightData, task: SpacecraftSettings, agent_radius: float, core_radius: float
+    data: FlightData,
+    task: SpacecraftSettings,
+    agent_radius: float,
+    core_radius: float,
+    receding: Receding | None = None,
 ) -> SetSamples:
     """Return features and labels of flights.
 
@@ -249,9 +254,10 @@ def flight_samples(
         task: Their task.
         agent_radius: Radius of every agent against the others [m].
         core_radius: Radius against obstacles [m].
+        receding: How far goals were shown; None for all the way.
     """
     sensed = Sensed.of(data.layout, data.observation)
-    features = spacecraft_features(sensed, task, agent_radius, core_radius)
+    features = spacecraft_features(sensed, task, agent_radius, core_radius, receding)
     plane = data.acceleration[:, 0] + 1j * data.acceleration[:, 1]
     plane *= features.frame.conj()
     target = np.stack([plane.real, plane.imag, data.acceleration[:, 2]], axis=-1)

@@ -24,10 +24,13 @@ from lagros_envs.checks import check_at_most, check_fields
 from lagros_envs.conventions import built_like
 from lagros_envs.numbers.functions import maximum, minimum
 from lagros_envs.tasks.spacecraft.scenarios import Preset
+from lagros_policies.tasks.spacecraft.pace import LEAST_TIME
 
 # The largest worlds in which the networks learned ways to their goals: in them goals are shown as
 # they are.
 LEARNED_AGENTS, LEARNED_ARENA = 8, 6.0  # [m]
+# Of a plan from rest to rest, the largest over the mean.
+SPEED_OF_PACE = 1.5
 COUNTERS = ("detours", "detour_steps")
 
 
@@ -102,15 +105,14 @@ class Receding:
             return cls() if given else None
         return built_like(cls(), given, "receding")
 
-    def shown(self, goal: Any) -> tuple[Any, Any]:
-        """Return the point that is shown, and the time that is left for it [s].
-
-        Args:
-            goal: Relative to the agent, a vector of any kind of number [m].
-        """
+    def shown(self, goal: Any) -> Any:
+        """Return the point that is shown of a goal relative to the agent, of any kind [m]."""
         distance = abs(goal)
-        share = minimum(self.reach / maximum(distance, self.reach), 1.0)
-        return goal * share, minimum(distance, self.reach) * (1.0 / self.pace)
+        return goal * minimum(self.reach / maximum(distance, self.reach), 1.0)
+
+    def time_to_go(self, distance: Any) -> Any:
+        """Return the time that is shown for the distance of that point [s]."""
+        return maximum(distance * (1.0 / self.pace), LEAST_TIME)
 
     def turned(
         self, goal: ComplexArray, memory: Waiting, arrived: float, period: float

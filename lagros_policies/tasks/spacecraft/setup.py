@@ -23,6 +23,8 @@ PLANE = [0, 1, 3, 4]
 PAIR_SHARE = math.sqrt(2.0)
 # Presets whose bodies the shipped networks met in training or in what is published about them.
 PUBLISHED = ("paper", "released")
+# The same of the network that has flown crowds.
+CROWDED = (*PUBLISHED, "gcbf")
 
 
 def task_and_preset(
@@ -65,11 +67,22 @@ def spacecraft_range(task: SpacecraftSettings, presets: Iterable[str | Preset]) 
         task: The task.
         presets: Those whose bodies it has met.
     """
-    names = ("control_period", "horizon", "sensing_radius", "thrust_limit")
+    chosen = [preset_named(preset) for preset in presets]
+    equal = {name: getattr(task, name) for name in ("control_period", "horizon")}
+    radii = [radii_of(preset)["radii"] for preset in chosen]
+    one_of: dict[str, Any] = {"radii": radii}
+    for name in ("sensing_radius", "thrust_limit"):
+        usual = getattr(task, name)
+        met = [getattr(settings_for(preset), name) for preset in chosen]
+        values = list(dict.fromkeys([usual, *met]))
+        if len(values) == 1:
+            equal[name] = usual
+        else:
+            one_of[name] = values
     return {
-        "equal": body_values(task.system) | {name: getattr(task, name) for name in names},
+        "equal": body_values(task.system) | equal,
         "at_most": {"time_limit": task.time_limit},
-        "one_of": {"radii": [radii_of(preset_named(preset))["radii"] for preset in presets]},
+        "one_of": one_of,
     }
 
 

@@ -1,9 +1,10 @@
 """The spacecraft experiment from nothing: expert flights, networks (a) and (c), their benchmark.
 
 The networks of (c) are fitted in rounds: the first to flights of the expert, each later one also to
-what the one before it met when it flew, labelled by the expert (DAgger). A last stage teaches how
-station is kept. Every stage leaves its files in the run's folder and is skipped where they are
-whole. The same settings give the same files, bit for bit on one machine.
+what the one before it met when it flew, labelled by the expert (DAgger). A further stage teaches
+how station is kept, and the last how crowds are flown. Every stage leaves its files in the run's
+folder and is skipped where they are whole. The same settings give the same files, bit for bit on
+one machine.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 from lagros_benchmarks.run.experiment import Progress
 from lagros_benchmarks.run.reproduction import Say, made_before
 from lagros_benchmarks.run.settings import BenchmarkSettings
+from lagros_envs.arrays import BoolArray, IntArray
 from lagros_envs.checks import check_fields
 from lagros_envs.files import write_atomic
 from lagros_envs.tasks.spacecraft.scenarios import preset_named
@@ -31,7 +33,9 @@ from lagros_policies.learning.train_deep_set import (
     SetSamples,
     fit_deep_set,
     join,
+    only,
 )
+from lagros_policies.tasks.spacecraft.crowds import CrowdSettings, fly_crowd
 from lagros_policies.tasks.spacecraft.expert import SpacecraftExpertSettings
 from lagros_policies.tasks.spacecraft.flights import (
     FlightData,
@@ -40,7 +44,7 @@ from lagros_policies.tasks.spacecraft.flights import (
     fly_expert,
 )
 from lagros_policies.tasks.spacecraft.sensed import Sensed
-from lagros_policies.tasks.spacecraft.setup import PUBLISHED, spacecraft_range
+from lagros_policies.tasks.spacecraft.setup import CROWDED, PUBLISHED, spacecraft_range
 from lagros_policies.tasks.spacecraft.station import StationSettings, fly_station
 from lagros_policies.trained_for import weights_record
 
@@ -59,6 +63,35 @@ def _rounds() -> tuple[FlightSettings, ...]:
     return (FlightSettings(worlds=800, replan_period=4.0, expert=stiff, seed=11),)
 
 
+def _crowds() -> tuple[tuple[CrowdSettings, ...], ...]:
+    scenes = (
+        ("swarm-45", 0.3, (12, 32)),
+        ("swarm-45", 0.4, (12, 32)),
+        ("swarm-45", 0.5, (12, 32)),
+        ("gcbf", 0.4, (10,)),
+        ("gcbf", 0.5, (10,)),
+    )
+    # Worlds of each scene, and seeds, by round.
+    rounds = (12, range(41, 46)), (8, range(51, 56))
+    return tuple(
+        tuple(
+            CrowdSettings(
+                FlightSettings(
+                    worlds=worlds,
+                    worlds_per_shard=4,
+                    agents=agents,
+                    preset=preset,
+                    sample_every=5,
+                    seed=seed,
+                ),
+                pace,
+            )
+            for (preset, pace, agents), seed in zip(scenes, seeds, strict=True)
+        )
+        for worlds, seeds in rounds
+    )
+
+
 @dataclass(frozen=True)
 class SpacecraftReproduceSettings:
     """All that the weights and the table depend on.
@@ -68,6 +101,9 @@ class SpacecraftReproduceSettings:
         calm: Its flights without, which (a) imitates.
         rounds: Flights of one network after the other, labelled by the expert.
         station: Flights of the last of these networks, labelled at the goal by one gain.
+        crowds: Flights of crowds, in rounds; the guide flies the first, networks the others.
+        kept: Flights of the network before these, labelled by itself: what it is not to forget.
+        kept_weight: How often the samples of these count, those of crowds once.
         relabelled_weight: How often the samples of these flights count, others once.
         label_limit: Longer labels of these flights are shortened to this [m/s^2]: a plan that
             begins well beside an agent asks for more than it takes to get there.
@@ -75,7 +111,9 @@ class SpacecraftReproduceSettings:
             from the goal, are left out: rest has no side, and teaches to rest.
         held_out: Share of the worlds of the last round whose samples are never trained on.
         intermediate: Training of the networks of the rounds.
-        lagros: Training of (c), from the weights of the last network.
+        station_training: Training of the network that keeps station, from the last one's weights.
+        lagros: Training of the networks that fly crowds, each from the weights of the one before;
+            the last is (c).
         learned: Training of (a).
         worlds: Paired worlds of the table at each bound.
         bounds: d_bar of the table, uniform in the ball.
@@ -95,14 +133,22 @@ class SpacecraftReproduceSettings:
     )
     rounds: tuple[FlightSettings, ...] = field(default_factory=_rounds)
     station: StationSettings = field(default_factory=StationSettings)
+    crowds: tuple[tuple[CrowdSettings, ...], ...] = field(default_factory=_crowds)
+    kept: StationSettings = field(
+        default_factory=lambda: StationSettings(
+            flights=FlightSettings(worlds=150, sample_every=9, seed=31)
+        )
+    )
+    kept_weight: int = 4
     relabelled_weight: int = 3
     label_limit: float = 2.0
     least_speed: float = 0.12
     held_out: float = 0.1
     intermediate: DeepSetTraining = field(default_factory=DeepSetTraining)
-    lagros: DeepSetTraining = field(
+    station_training: DeepSetTraining = field(
         default_factory=lambda: DeepSetTraining(epochs=4, learning_rate=1e-3)
     )
+    lagros: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=6))
     learned: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=4))
     worlds: int = 20
     bounds: tuple[float, ...] = BOUNDS
@@ -125,16 +171,16 @@ class SpacecraftReproduceSettings:
         """Make expert flights and networks; see `reproduction.reproduce`."""
         stage = _Stage(folder, self, progress, say)
         calm = stage.fly("calm flights", self.calm, None)
-        stage.fit("learned", self.learned, [calm], calm)
-        parts = [stage.fly("flights", self.flights, None)]
+        stage.fit("learned", self.learned, [stage.samples(calm)], stage.samples(calm))
+        parts = [stage.samples(stage.fly("flights", self.flights, None))]
         learner = stage.fit("round0", self.intermediate, parts, parts[0])
         for index, flights in enumerate(self.rounds, start=1):
             met = stage.fly(f"{_RELABELLED}{index}", flights, learner)
-            kept = training_part(met, self)
+            kept = stage.samples(training_part(met, self))
             parts += [kept] * self.relabelled_weight
-            test = _only(met, _split(met, self.held_out))
+            test = stage.samples(_only(met, _split(met, self.held_out)))
             learner = stage.fit(f"round{index}", self.intermediate, parts, test)
-        stage.finish(learner)
+        stage.crowds(stage.station(learner))
 
     def benchmark(self, folder: Path | None) -> BenchmarkSettings:
         """Return the benchmark of (a), (b), (c) and (d), with a folder's weights or ours."""
@@ -185,57 +231,93 @@ class _Stage:
         )
         return data
 
-    def finish(self, learner: Path) -> None:
-        """Teach the last network how station is kept: (c)."""
-        begun = perf_counter()
+    def station(self, learner: Path) -> Path:
+        """Teach the last network how station is kept."""
+        data = self._fly_station("station", self.settings.station, learner)
+        held_out = _split(data, self.settings.held_out)
+        parts, test = [self.samples(_only(data, ~held_out))], self.samples(_only(data, held_out))
+        training = self.settings.station_training
+        return self.fit("station", training, parts, test, learner, _labels_error(learner))
+
+    def crowds(self, learner: Path) -> None:
+        """Teach that network how crowds are flown: (c)."""
         settings = self.settings
-        station = settings.station
+        kept = self.samples(self._fly_station("kept", settings.kept, learner))
+        parts = [kept] * settings.kept_weight
+        rounds = settings.crowds
+        more = json.loads(learner.with_suffix(".json").read_text())
+        for index, scenes in enumerate(rounds):
+            tests = []
+            for scene, crowd in enumerate(scenes):
+                samples = self._fly_crowd(f"crowd{index}_{scene}", crowd, learner, index == 0)
+                held_out = _held_out(samples.world, settings.held_out)
+                parts.append(only(samples, ~held_out))
+                tests.append(only(samples, held_out))
+            name = "lagros" if index == len(rounds) - 1 else f"crowd{index}"
+            said = {key: more[key] for key in ("labels_error",) if key in more}
+            learner = self.fit(name, settings.lagros, parts, join(tests), learner, said, CROWDED)
+
+    def _fly_station(self, name: str, station: StationSettings, learner: Path) -> FlightData:
+        begun = perf_counter()
         data = fly_station(
-            self.folder / "station",
+            self.folder / name,
             station,
             self.task,
             learner,
-            settings.jobs,
-            lambda done: self.progress("station", done, station.flights.shards),
-            settings.backend,
+            self.settings.jobs,
+            lambda done: self.progress(name, done, station.flights.shards),
+            self.settings.backend,
         )
-        self.say(f"station ({perf_counter() - begun:.0f} s): {len(data.observation)} samples")
-        held_out = _split(data, settings.held_out)
-        parts, test = [_only(data, ~held_out)], _only(data, held_out)
-        labels = json.loads(learner.with_suffix(".json").read_text())["learning_error"]
-        self.fit("lagros", settings.lagros, parts, test, learner, {"labels_error": labels})
+        self.say(f"{name} ({perf_counter() - begun:.0f} s): {len(data.observation)} samples")
+        return data
+
+    def _fly_crowd(
+        self, name: str, crowd: CrowdSettings, learner: Path, guided: bool
+    ) -> SetSamples:
+        begun = perf_counter()
+        samples = fly_crowd(
+            self.folder / name,
+            crowd,
+            learner,
+            guided,
+            self.settings.jobs,
+            lambda done: self.progress(name, done, crowd.flights.shards),
+            self.settings.backend,
+        )
+        self.say(f"{name} ({perf_counter() - begun:.0f} s): {len(samples)} samples")
+        return samples
 
     def fit(
         self,
         name: str,
         training: DeepSetTraining,
-        parts: list[FlightData],
-        test: FlightData,
+        parts: list[SetSamples],
+        test: SetSamples,
         begun_from: Path | None = None,
         more: Mapping[str, Any] | None = None,
+        presets: tuple[str, ...] = PUBLISHED,
     ) -> Path:
         """Fit one network, unless its file is whole, and write its record beside it."""
         weights = _weights(self.folder, name)
         begun = perf_counter()
         if made_before(lambda: DeepSet.load(weights), self.say) is None:
-            samples = join([self._samples(part) for part in parts])
             network = fit_deep_set(
-                samples,
+                join(parts),
                 training,
                 self.folder / f"{name}_checkpoint.safetensors",
                 lambda epoch, _: self.progress(f"fit {name}", epoch, training.epochs),
                 None if begun_from is None else DeepSet.load(begun_from),
             )
-            trained_for = spacecraft_range(self.task, PUBLISHED)
+            trained_for = spacecraft_range(self.task, presets)
             network.metadata.update(weights_record("spacecraft", name, trained_for))
             network.save(weights)
         fitted = DeepSet.load(weights)
-        error = _learning_error(fitted, self._samples(test))
+        error = _learning_error(fitted, test)
         record = {
             "policy": name,
             "command": "lagros reproduce spacecraft",
             "training": asdict(training),
-            "samples": sum(len(part.observation) for part in parts),
+            "samples": sum(len(part) for part in parts),
             "weights": fitted.weights,
             "learning_error": error,
             **(more or {}),
@@ -247,7 +329,8 @@ class _Stage:
         )
         return weights
 
-    def _samples(self, data: FlightData) -> SetSamples:
+    def samples(self, data: FlightData) -> SetSamples:
+        """Return features and labels of flights in worlds of the paper."""
         preset = preset_named(self.settings.flights.preset)
         return flight_samples(data, self.task, preset.agent_radius, preset.core)
 
@@ -270,9 +353,18 @@ def _learning_error(network: DeepSet, samples: SetSamples) -> dict[str, Any]:
     }
 
 
-def _split(data: FlightData, share: float) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def _labels_error(learner: Path) -> dict[str, Any]:
+    """Return how far a network was from its labels, for those who learn from it."""
+    return {"labels_error": json.loads(learner.with_suffix(".json").read_text())["learning_error"]}
+
+
+def _split(data: FlightData, share: float) -> BoolArray:
+    return _held_out(data.world, share)
+
+
+def _held_out(world: IntArray, share: float) -> BoolArray:
     every = max(2, round(1.0 / share))
-    return np.asarray(data.world % every == 0)
+    return np.asarray(world % every == 0)
 
 
 def training_part(data: FlightData, settings: SpacecraftReproduceSettings) -> FlightData:
@@ -289,6 +381,6 @@ def training_part(data: FlightData, settings: SpacecraftReproduceSettings) -> Fl
     return replace(kept, acceleration=label)
 
 
-def _only(data: FlightData, chosen: np.ndarray[Any, np.dtype[np.bool_]]) -> FlightData:
+def _only(data: FlightData, chosen: BoolArray) -> FlightData:
     rows = {name: getattr(data, name)[chosen] for name in ("observation", "acceleration", "world")}
     return replace(data, **rows)
