@@ -169,7 +169,7 @@ def test_what_a_task_does_not_say_is_asked_for():
 
 SPACECRAFT_FILES = tuple(
     f"spacecraft_{name}.{suffix}"
-    for name in ("lagros", "learned")
+    for name in ("lagros", "learned", "crowds")
     for suffix in ("safetensors", "json")
 )
 
@@ -203,8 +203,8 @@ def small_spacecraft():
         ),
         held_out=0.5,
         intermediate=training,
-        station_training=training,
         lagros=training,
+        crowd_training=training,
         learned=training,
         worlds=1,
         bounds=(0.4,),

@@ -76,7 +76,7 @@ class SpacecraftActor(BasePolicy):
     ) -> None:
         self.settings, self.preset = task_and_preset(settings, preset, num_agents)
         self.layout = Layout.for_preset(self.preset, self.settings)
-        given = PRETRAINED / self.weights_file if weights is None else weights
+        given = PRETRAINED / self._shipped() if weights is None else weights
         ready = isinstance(given, self.kind)
         what = "the network" if ready else str(given)
         self.network = given if ready else self.kind.load(cast(Path, given))
@@ -94,6 +94,10 @@ class SpacecraftActor(BasePolicy):
             allow_other_settings,
             radii_of(self.preset),
         )
+
+    def _shipped(self) -> str:
+        """Return the name of the file that is flown where none is given."""
+        return self.weights_file
 
     def _looked_at(self) -> task.SpacecraftSettings:
         """Return the settings that are held against those of the training."""
@@ -138,7 +142,7 @@ class SpacecraftNetworkPolicy(SpacecraftActor):
     @cached_property
     def receding(self) -> Receding | None:
         """How far goals are shown; None for all the way."""
-        return Receding.chosen(self._asked, self.preset)
+        return Receding.chosen(self._asked, self.preset, self.settings.horizon)
 
     def _looked_at(self) -> task.SpacecraftSettings:
         # Who is always shown the same time is not tied to T or to the end of an episode.
@@ -232,7 +236,13 @@ class SpacecraftLearnedPolicy(SpacecraftNetworkPolicy):
 
 
 class SpacecraftLagrosPolicy(SpacecraftNetworkPolicy):
-    """Policy (c): o_l -> u* of each spacecraft from what it senses alone."""
+    """Policy (c): o_l -> u* of each spacecraft from what it senses alone.
+
+    Where goals recede it flies the network that has learned crowds, if no weights are given.
+    """
 
     name = recorded_as = "lagros"
     weights_file = "spacecraft_lagros.safetensors"
+
+    def _shipped(self) -> str:
+        return self.weights_file if self.receding is None else "spacecraft_crowds.safetensors"

@@ -31,6 +31,8 @@ from lagros_policies.tasks.spacecraft.pace import LEAST_TIME
 LEARNED_AGENTS, LEARNED_ARENA = 8, 6.0  # [m]
 # Of a plan from rest to rest, the largest over the mean.
 SPEED_OF_PACE = 1.5
+# Usual paces [m/s]; where the side of the arena over T asks for more it is more, up to the second.
+SLOWEST, FASTEST = 0.4, 0.5
 COUNTERS = ("detours", "detour_steps")
 
 
@@ -77,7 +79,7 @@ class Receding:
     """
 
     reach: float = 2.0
-    pace: float = 0.3
+    pace: float = SLOWEST
     progress: float = 0.1
     patience: float = 3.0
     angle: float = 1.5
@@ -88,22 +90,24 @@ class Receding:
         check_at_most("angle", self.angle, float(np.pi))
 
     @classmethod
-    def chosen(cls, given: Any, preset: Preset) -> Receding | None:
+    def chosen(cls, given: Any, preset: Preset, horizon: float) -> Receding | None:
         """Return what an argument `receding` of a policy means.
 
         Args:
             given: True or False; a `Receding`, or a mapping of its fields that differ; None for
                 receding goals where worlds are larger than those in which the networks learned.
             preset: Of the worlds, with their number of agents.
+            horizon: T, for which the usual pace is chosen [s].
 
         Raises:
             ValueError: It is something else, a field is unknown, or a value is out of range.
         """
         if given is None:
             given = preset.agents > LEARNED_AGENTS or preset.arena > LEARNED_ARENA
+        usual = cls(pace=min(max(preset.arena / horizon, SLOWEST), FASTEST))
         if isinstance(given, bool):
-            return cls() if given else None
-        return built_like(cls(), given, "receding")
+            return usual if given else None
+        return built_like(usual, given, "receding")
 
     def shown(self, goal: Any) -> Any:
         """Return the point that is shown of a goal relative to the agent, of any kind [m]."""

@@ -111,9 +111,9 @@ class SpacecraftReproduceSettings:
             from the goal, are left out: rest has no side, and teaches to rest.
         held_out: Share of the worlds of the last round whose samples are never trained on.
         intermediate: Training of the networks of the rounds.
-        station_training: Training of the network that keeps station, from the last one's weights.
-        lagros: Training of the networks that fly crowds, each from the weights of the one before;
-            the last is (c).
+        lagros: Training of (c), from the weights of the last network.
+        crowd_training: Training of the networks that fly crowds, each from the weights of the one
+            before; the last is (c) of worlds of many.
         learned: Training of (a).
         worlds: Paired worlds of the table at each bound.
         bounds: d_bar of the table, uniform in the ball.
@@ -145,10 +145,10 @@ class SpacecraftReproduceSettings:
     least_speed: float = 0.12
     held_out: float = 0.1
     intermediate: DeepSetTraining = field(default_factory=DeepSetTraining)
-    station_training: DeepSetTraining = field(
+    lagros: DeepSetTraining = field(
         default_factory=lambda: DeepSetTraining(epochs=4, learning_rate=1e-3)
     )
-    lagros: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=6))
+    crowd_training: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=6))
     learned: DeepSetTraining = field(default_factory=lambda: DeepSetTraining(epochs=4))
     worlds: int = 20
     bounds: tuple[float, ...] = BOUNDS
@@ -232,15 +232,15 @@ class _Stage:
         return data
 
     def station(self, learner: Path) -> Path:
-        """Teach the last network how station is kept."""
+        """Teach the last network how station is kept: (c)."""
         data = self._fly_station("station", self.settings.station, learner)
         held_out = _split(data, self.settings.held_out)
         parts, test = [self.samples(_only(data, ~held_out))], self.samples(_only(data, held_out))
-        training = self.settings.station_training
-        return self.fit("station", training, parts, test, learner, _labels_error(learner))
+        training = self.settings.lagros
+        return self.fit("lagros", training, parts, test, learner, _labels_error(learner))
 
     def crowds(self, learner: Path) -> None:
-        """Teach that network how crowds are flown: (c)."""
+        """Teach that network how crowds are flown: (c) of worlds of many."""
         settings = self.settings
         kept = self.samples(self._fly_station("kept", settings.kept, learner))
         parts = [kept] * settings.kept_weight
@@ -253,9 +253,11 @@ class _Stage:
                 held_out = _held_out(samples.world, settings.held_out)
                 parts.append(only(samples, ~held_out))
                 tests.append(only(samples, held_out))
-            name = "lagros" if index == len(rounds) - 1 else f"crowd{index}"
+            name = "crowds" if index == len(rounds) - 1 else f"crowd{index}"
             said = {key: more[key] for key in ("labels_error",) if key in more}
-            learner = self.fit(name, settings.lagros, parts, join(tests), learner, said, CROWDED)
+            learner = self.fit(
+                name, settings.crowd_training, parts, join(tests), learner, said, CROWDED
+            )
 
     def _fly_station(self, name: str, station: StationSettings, learner: Path) -> FlightData:
         begun = perf_counter()
@@ -309,7 +311,8 @@ class _Stage:
                 None if begun_from is None else DeepSet.load(begun_from),
             )
             trained_for = spacecraft_range(self.task, presets)
-            network.metadata.update(weights_record("spacecraft", name, trained_for))
+            flown_as = "lagros" if name.startswith("crowd") else name
+            network.metadata.update(weights_record("spacecraft", flown_as, trained_for))
             network.save(weights)
         fitted = DeepSet.load(weights)
         error = _learning_error(fitted, test)
