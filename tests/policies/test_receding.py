@@ -54,7 +54,7 @@ def pocket():
 SCENES = {one.__name__: one for one in (head_on, corridor, ring, parked_crowd, pocket)}
 
 
-def flown(scenario, bound, receding, seconds=45.0, worlds=2):
+def flown(scenario, bound, receding, seconds=120.0, worlds=2):
     """Fly a scene with the filter; return the last info and the policy's counters."""
     agents = scenario.num_agents
     preset = Preset(agents=agents, arena=10.0, obstacle_count=(0, len(scenario.obstacles)))
@@ -94,8 +94,8 @@ def test_it_is_the_rule_that_solves_them(name, bound):
     assert not patient["success"].all()
     _, counted = flown(SCENES[name](), bound, True)
     assert counted["detours"] > 0
-    # An arrival ends one early.
-    assert 0 < counted["detour_steps"] <= 50 * counted["detours"]
+    # The longest last 20 s; an arrival ends one early.
+    assert 0 < counted["detour_steps"] <= 200 * counted["detours"]
 
 
 @pytest.mark.parametrize("kind", [complex, np.complex128])
@@ -117,7 +117,7 @@ def test_the_goal_shown_is_at_most_the_reach_ahead(kind):
 def one_agent(receding, distances, arrived):
     """The rule in words, one agent after the other: by which angle its goal is turned, when."""
     angles, closest, idle, away, detours = [], math.inf, 0, 0, 0
-    patience, detour = round(receding.patience / H), round(receding.detour / H)
+    patience = round(receding.patience / H)
     for distance in distances:
         if away:
             away = 0 if distance <= arrived else away - 1
@@ -130,14 +130,17 @@ def one_agent(receding, distances, arrived):
         else:
             idle += 1
             if idle == patience:
-                detours, away, idle, closest = detours + 1, detour, 0, distance
-        angles.append(receding.angle * (1 if detours % 2 else -1) if away else 0.0)
+                times = (1, 1, 2, 2, 3, 3, 4)[min(detours, 6)]
+                away = round(times * receding.detour / H)
+                detours, idle, closest = detours + 1, 0, distance
+        angle = receding.angle + (0, 0, 0, 1, 1, 2)[min(detours, 5)] * receding.wider
+        angles.append(angle * (1 if detours % 4 in (1, 2) else -1) if away else 0.0)
     return angles, detours
 
 
 def test_the_rule_is_what_its_words_say():
     rng = np.random.default_rng(3)
-    receding = Receding(progress=0.1, patience=0.5, angle=0.9, detour=0.8)
+    receding = Receding(progress=0.1, patience=0.5, angle=0.9, wider=0.3, detour=0.8)
     walks = np.abs(np.cumsum(rng.normal(-0.01, 0.08, (400, 30)), axis=0) + rng.uniform(0, 3, 30))
     direction = np.exp(1j * rng.uniform(-np.pi, np.pi, walks.shape))
     memory, turns = Waiting.begun(30), []

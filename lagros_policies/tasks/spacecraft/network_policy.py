@@ -142,7 +142,8 @@ class SpacecraftNetworkPolicy(SpacecraftActor):
     @cached_property
     def receding(self) -> Receding | None:
         """How far goals are shown; None for all the way."""
-        return Receding.chosen(self._asked, self.preset, self.settings.horizon)
+        settings = self.settings
+        return Receding.chosen(self._asked, self.preset, settings.horizon, settings.speed_limit)
 
     def _looked_at(self) -> task.SpacecraftSettings:
         # Who is always shown the same time is not tied to T or to the end of an episode.

@@ -8,8 +8,9 @@ Agents that wait for each other wait for ever: all see the same at every step. T
 needs no word between them and three numbers of each:
 
     Who has not come `progress` closer to its goal than ever before for `patience`, and has not
-    arrived, is shown the point ahead turned about itself by `angle` for `detour`, counter-clockwise
-    the first time, clockwise the next, and so on by turns. Then it counts anew from where it is.
+    arrived, is shown the point ahead turned about itself by `angle` for `detour`: twice
+    counter-clockwise, then twice clockwise, and so on, each two by `wider` more than the two
+    before, and for `detour` more, up to three times. Then it counts anew from where it is.
 """
 
 from __future__ import annotations
@@ -31,8 +32,12 @@ from lagros_policies.tasks.spacecraft.pace import LEAST_TIME
 LEARNED_AGENTS, LEARNED_ARENA = 8, 6.0  # [m]
 # Of a plan from rest to rest, the largest over the mean.
 SPEED_OF_PACE = 1.5
-# Usual paces [m/s]; where the side of the arena over T asks for more it is more, up to the second.
-SLOWEST, FASTEST = 0.4, 0.5
+# Usual paces [m/s]: the first, or that at which the longest ways, of 1.28 times the side of the
+# arena, take three quarters of T, up to the second.
+SLOWEST, FASTEST = 0.4, 0.7
+LONGEST_WAY, SHARE_OF_TIME = 1.28, 0.75
+# How often detours become wider, and how often longer.
+_WIDER, _LONGER = 2, 3
 COUNTERS = ("detours", "detour_steps")
 
 
@@ -71,8 +76,9 @@ class Receding:
         pace: Distance of what is shown over the time that is shown for it [m/s].
         progress: How much closer counts as progress [m].
         patience: Time without progress before a detour [s].
-        angle: By which the point ahead is turned about the agent [rad].
-        detour: Time for which it is [s].
+        angle: By which the point ahead is turned about the agent first [rad].
+        wider: By which it is turned more after each two detours [rad].
+        detour: Time for which it is first, and by which that grows after each two detours [s].
 
     Raises:
         ValueError: A value is out of range.
@@ -83,14 +89,18 @@ class Receding:
     progress: float = 0.1
     patience: float = 3.0
     angle: float = 1.5
+    wider: float = 0.35
     detour: float = 5.0
 
     def __post_init__(self) -> None:
-        check_fields(self, positive=[item.name for item in fields(self)])
-        check_at_most("angle", self.angle, float(np.pi))
+        positive = [item.name for item in fields(self) if item.name != "wider"]
+        check_fields(self, positive=positive, not_negative=("wider",))
+        check_at_most("angle", self.angle + _WIDER * self.wider, float(np.pi))
 
     @classmethod
-    def chosen(cls, given: Any, preset: Preset, horizon: float) -> Receding | None:
+    def chosen(
+        cls, given: Any, preset: Preset, horizon: float, speed_limit: float | None = None
+    ) -> Receding | None:
         """Return what an argument `receding` of a policy means.
 
         Args:
@@ -98,13 +108,16 @@ class Receding:
                 receding goals where worlds are larger than those in which the networks learned.
             preset: Of the worlds, with their number of agents.
             horizon: T, for which the usual pace is chosen [s].
+            speed_limit: Largest speed [m/s], which is 1.5 times a pace; None for no limit.
 
         Raises:
             ValueError: It is something else, a field is unknown, or a value is out of range.
         """
         if given is None:
             given = preset.agents > LEARNED_AGENTS or preset.arena > LEARNED_ARENA
-        usual = cls(pace=min(max(preset.arena / horizon, SLOWEST), FASTEST))
+        fastest = FASTEST if speed_limit is None else min(FASTEST, speed_limit / SPEED_OF_PACE)
+        asked = min(LONGEST_WAY * preset.arena / (SHARE_OF_TIME * horizon), fastest)
+        usual = cls(pace=max(asked, SLOWEST))
         if isinstance(given, bool):
             return usual if given else None
         return built_like(usual, given, "receding")
@@ -133,16 +146,19 @@ class Receding:
             The goals, turned about those who are on a detour, and the memories.
         """
         distance, away = np.abs(goal), memory.waited < 0.0
-        patience, detour = (max(1, round(time / period)) for time in (self.patience, self.detour))
+        patience = max(1, round(self.patience / period))
+        pair = memory.detours // 2  # of the detour that begins now, if one does
+        detour = np.round((1.0 + np.minimum(pair, _LONGER)) * self.detour / period)
         closer = distance <= memory.closest - self.progress
         idle = (distance > arrived) & (away | ~closer)
         waited = np.where(idle, memory.waited + 1.0, 0.0)
         begins = waited >= patience
-        waited = np.where(begins, -detour, waited)
+        waited = np.where(begins, -np.maximum(detour, 1.0), waited)
         # Until a detour has ended the count begins anew at every step.
         closest = np.where(closer | away, distance, memory.closest)
         detours, away = memory.detours + begins, waited < 0.0
         closest = np.where(away, distance, closest)
         memory = Waiting(closest, waited, detours, memory.steps + away)
-        side = np.where(detours % 2 == 1, 1.0, -1.0)
-        return goal * np.exp(1j * self.angle * (away * side)), memory
+        pair = (detours - 1.0) // 2
+        turn = self.angle + self.wider * np.minimum(pair, _WIDER)
+        return goal * np.exp(1j * turn * np.where(pair % 2 == 0, away, -1.0 * away)), memory
