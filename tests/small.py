@@ -59,8 +59,10 @@ SMALL = {
     ),
     "train": ("--segments", "1", "--seed", "0", "--quiet"),
     "watch": ("--seconds", "0.5"),
+    "python benchmarks/speed/costs.py": ("--plans", "1", "--tasks", "docking"),
     "python benchmarks/speed/spacecraft_world.py": ("--sizes", "1x8", "--rounds", "1"),
     "python benchmarks/studies/plan_law.py": ("--episodes", "1"),
+    "python benchmarks/studies/swarms.py": ("--cells", "gcbf-free", "--agents", "8"),
     "python benchmarks/studies/plan_tubes.py": (
         "--tasks",
         "car",
