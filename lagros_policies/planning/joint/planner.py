@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -12,16 +13,12 @@ import numpy as np
 
 from lagros_envs.arrays import FloatArray, IntArray
 from lagros_envs.checks import check_fields, check_not_negative, check_positive
-from lagros_policies.planning.grid_path import (
-    GridSettings,
-    shortest_paths,
-    smooth_progress,
-    walk,
-)
+from lagros_policies.planning.grid_path import GridSettings, shortest_paths, smooth_progress, walk
 from lagros_policies.planning.joint.plan import JointPlan, divisor, instants, swept_distances
 from lagros_policies.planning.joint.problem import JointProblem, JointScpSettings
 from lagros_policies.planning.joint.scp import JointSolution, positions_between, solve_joint
 from lagros_policies.planning.joint.search import search_in_turn
+from lagros_policies.planning.joint.turns import ALL_AT_ONCE, MOST_PASSES, solve_many
 
 # Distances are planned wider by this, so that a swept check finds the margins themselves kept [m].
 _SPARE = 5e-3
@@ -169,31 +166,33 @@ class JointPlanner:
         solved: list[JointPlan] = []
         closest: tuple[float, JointPlan] | None = None
         iterations = attempts = 0
+        many = len(scene.starts) > ALL_AT_ONCE
+        solve = solve_many if many else solve_joint
+        left = MOST_PASSES if many else sys.maxsize
         # A goal that is too far for the speed: one program shows how near it comes.
         few = 1 if self._beyond_reach(scene) else None
-        for margin in settings.margins[:few]:
-            problem = self._problem(scene, nodes, margin)
-            for name, guess in islice(self._guesses(scene, problem, margin), few):
-                solution = solve_joint(problem, guess, settings.scp)
-                iterations += solution.iterations
-                attempts += 1
-                plan = self._checked(scene, solution, name, nodes, margin)
-                if plan.solved:
-                    solved.append(plan)
-                    if len(solved) >= settings.candidates:
-                        break
-                elif closest is None or solution.violation < closest[0]:
-                    closest = solution.violation, plan
-            if solved:
+        for margin, problem, name, guess in self._attempts(scene, nodes, few):
+            if left <= 0 or (solved and margin < solved[0].margin):
                 break
+            limits = replace(settings.scp, max_iterations=min(settings.scp.max_iterations, left))
+            solution = solve(problem, guess, limits)
+            iterations, attempts = iterations + solution.iterations, attempts + 1
+            left -= solution.iterations
+            plan = self._checked(scene, solution, name, nodes, margin)
+            if plan.solved:
+                solved.append(plan)
+                if len(solved) >= settings.candidates:
+                    break
+            elif closest is None or solution.violation < closest[0]:
+                closest = solution.violation, plan
         if solved:
             chosen = min(solved, key=lambda plan: float(np.sum(plan.effort)))
         else:
             assert closest is not None  # the first guess always exists
             chosen = closest[1]
             if few is not None:
-                far = f"a goal is out of reach at speed_limit={settings.speed_limit:g} m/s"
-                chosen = replace(chosen, status=f"{chosen.status}; {far}")
+                far = f"; a goal is out of reach at speed_limit={settings.speed_limit:g} m/s"
+                chosen = replace(chosen, status=chosen.status + far)
         seconds = time.perf_counter() - begun
         return replace(chosen, iterations=iterations, attempts=attempts, seconds=seconds)
 
@@ -279,6 +278,15 @@ class JointPlanner:
         obstacle_required = np.minimum(growing, obstacle_required)
         pair_required = np.minimum(pair_growing, pair_required)
         return np.minimum(obstacle_required, full), np.minimum(pair_required, full_pair)
+
+    def _attempts(
+        self, scene: _Scene, nodes: int, few: int | None
+    ) -> Iterator[tuple[float, JointProblem, str, FloatArray]]:
+        """Yield margins, problems, and names and guesses for them, the first `few` of each."""
+        for margin in self.settings.margins[:few]:
+            problem = self._problem(scene, nodes, margin)
+            for name, guess in islice(self._guesses(scene, problem, margin), few):
+                yield margin, problem, name, guess
 
     def _guesses(
         self, scene: _Scene, problem: JointProblem, margin: float

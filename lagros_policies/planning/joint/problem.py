@@ -9,6 +9,7 @@ import numpy as np
 
 from lagros_envs.arrays import FloatArray, IntArray
 from lagros_envs.checks import check_above, check_fields
+from lagros_policies.planning.vectors import lengths
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +55,8 @@ class JointProblem:
     Attributes:
         starts: [p, v] at t = 0, shape (n, 4) [m, m/s].
         goals: [p, v] at the end, shape (n, 4).
-        obstacles: Centres, shape (m, 2) [m].
+        obstacles: Centres, shape (m, 2), or where they are at the control instants, shape
+            (K + 1, m, 2) [m].
         obstacle_required: R_ij at the control instants, shape (K + 1, n, m) [m].
         pair_required: R_ij at the control instants for the pairs of `pairs`, shape (K + 1, P) [m].
         node_period: Time from node to node [s].
@@ -101,7 +103,7 @@ def largest_violation(problem: JointProblem, places: FloatArray) -> float:
         places: Positions at the control instants, shape (n, K + 1, 2) [m].
     """
     first, second = problem.pairs
-    apart = np.linalg.norm(places[first] - places[second], axis=-1).T
-    gaps = np.linalg.norm(places[:, :, None] - problem.obstacles, axis=-1).transpose(1, 0, 2)
+    apart = lengths(places[first] - places[second]).T
+    gaps = lengths(places[:, :, None] - problem.obstacles).transpose(1, 0, 2)
     short = [problem.pair_required - apart, problem.obstacle_required - gaps]
     return max(0.0, *(float(np.max(part, initial=0.0)) for part in short))

@@ -10,7 +10,7 @@ from scipy import sparse
 from lagros_envs.arrays import FloatArray, IntArray
 from lagros_policies.planning.joint.problem import JointProblem, JointScpSettings
 from lagros_policies.planning.qp import UNBOUNDED, QuadraticProgram
-from lagros_policies.planning.vectors import unit_vectors
+from lagros_policies.planning.vectors import lengths, unit_vectors
 
 # Entries of some equalities by row, column and value, and their right sides.
 Equalities = tuple[list[tuple[IntArray, IntArray, FloatArray]], FloatArray]
@@ -180,15 +180,16 @@ def _half_planes(
     first, second = problem.pairs
     # Obstacles: the second agent takes no part.
     delta = places[:, :, None, :] - problem.obstacles
-    distance = np.linalg.norm(delta, axis=-1)
+    distance = lengths(delta)
     required = problem.obstacle_required.transpose(1, 0, 2)
     agent, instant, disc = np.nonzero(distance < required + reach[None, :, None])
     chosen = agent, instant, disc
     normal = unit_vectors(delta[chosen], distance[chosen])
-    offset = required[chosen] + np.sum(normal * problem.obstacles[disc], axis=-1)
+    centres = np.broadcast_to(problem.obstacles, (last + 1, *problem.obstacles.shape[-2:]))
+    offset = required[chosen] + np.sum(normal * centres[instant, disc], axis=-1)
     # Pairs.
     between = places[first] - places[second]
-    apart = np.linalg.norm(between, axis=-1)
+    apart = lengths(between)
     needed = problem.pair_required.T
     pair, when = np.nonzero(apart < needed + reach[None, :])
     side = unit_vectors(between[pair, when], apart[pair, when])
