@@ -160,6 +160,8 @@ def test_the_folder_of_a_run_names_what_it_is(tmp_path):
         "spacecraft-ppo",
         "seed-0",
     )
+    elsewhere = SpacecraftTraining().in_worlds("gcbf", None)
+    assert command.folder_of(elsewhere, tmp_path).parts[-2:] == ("spacecraft-ppo-gcbf-8", "seed-0")
 
 
 @pytest.mark.parametrize(
@@ -175,7 +177,10 @@ def test_the_folder_of_a_run_names_what_it_is(tmp_path):
         (["cartpole", "--algo", "ppo,,ppo"], "--algo: an entry is empty"),
         (["cartpole", "--segments", "0"], "segments=0"),
         (["cartpole", "--parallel-env"], "for many agents"),
+        (["cartpole", "--agents", "3"], "for many agents"),
         (["spacecraft", "--residual", "3"], "for one body"),
+        (["spacecraft", "--preset", "gcfb"], "preset='gcfb'"),
+        (["spacecraft", "--preset", "gcbf", "--agents", "0"], "agents=0"),
         (["cartpole", "--residual", "-3"], "--residual=-3.0"),
         (["cartpole", "--residual", "1e9"], "more than the actuator's 40 N"),
         (["cartpole", "--figure", "a.txt"], "must end in"),

@@ -347,6 +347,21 @@ def test_the_worlds_in_training_are_those_of_the_settings(parallel_env):
     assert venv.gamma == run.algorithm.discount
 
 
+def test_in_other_worlds_as_many_agents_learn_for_the_same_share_of_the_time():
+    run = SpacecraftTraining()
+    assert run.in_worlds(None, None) == replace(run, final_presets=("paper",))
+    other = run.in_worlds("gcbf", 16)
+    assert (other.preset, other.agents, other.worlds) == ("gcbf", 16, 9)
+    assert (other.final_presets, other.final_agents) == (("gcbf",), (16,))
+    # 77 s and 45 s are the limits of the presets, and the side of gcbf grows with sqrt(N / 8).
+    assert other.time_limit == round(20.0 * 77.0 * 2.0**0.5 / 45.0)
+    small = replace(TINY.in_worlds("gcbf", 4), time_limit=1.0)
+    venv = training.SpacecraftLesson(small).venv
+    settings = venv.get_attr("settings")[0]
+    assert (settings.speed_limit, settings.thrust_limit) == (0.5, 1.0)
+    assert venv.num_envs == 4 * small.worlds
+
+
 def test_both_routes_train_the_same_agent():
     weights = []
     for parallel_env in (False, True):

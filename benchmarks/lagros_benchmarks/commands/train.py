@@ -60,6 +60,12 @@ def train(
             help="Learn a correction of LAG-ROS of at most so much, in units of the control.",
         ),
     ] = None,
+    preset: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Of many agents: worlds of another preset.")
+    ] = None,
+    agents: Annotated[
+        int | None, typer.Option(metavar="N", help="Of many agents: how many in a world.")
+    ] = None,
     parallel_env: Annotated[
         bool,
         typer.Option(
@@ -90,6 +96,10 @@ def train(
         many = course_of(described).takes_parallel
         if parallel_env and not many:
             raise ValueError(f"--parallel-env is for many agents; leave it out for {task}")
+        if not many and (preset, agents) != (None, None):
+            raise ValueError(
+                f"--preset and --agents are for many agents; leave them out for {task}"
+            )
         if residual is not None and many:
             raise ValueError(f"--residual is for one body; leave it out for {task}")
         fill = names == (_MISSING,)
@@ -108,6 +118,8 @@ def train(
         if residual is not None:
             changes["largest_correction"] = residual
         runs = [_run(described.name, name, number, changes) for number in seeds for name in names]
+        if (preset, agents) != (None, None):
+            runs = [run.in_worlds(preset, agents) for run in runs]  # type: ignore[union-attr]
         if figure is not None:
             from lagros_benchmarks.report.canvas import check_figure_path
 
@@ -118,10 +130,11 @@ def train(
         )
     except ValueError as error:
         fail(str(error).replace("largest_correction", "--residual"))
+    options = {"--segments": segments, "--preset": preset, "--agents": agents}
+    asked = "".join(f" {name} {value}" for name, value in options.items() if value is not None)
     try:
         records = [
-            _train_one(run, out, segments, residual, tensorboard, parallel_env, fill)
-            for run in runs
+            _train_one(run, out, asked, residual, tensorboard, parallel_env, fill) for run in runs
         ]
     except (ImportError, ValueError, OSError) as error:
         # An extra that is not installed, a folder of another run, a full disk.
@@ -157,7 +170,7 @@ def folder_of(run: Training | C3mRun, out: Path) -> Path:
 def _train_one(
     run: Training | C3mRun,
     out: Path,
-    segments: int | None,
+    asked: str,
     residual: float | None,
     tensorboard: bool,
     parallel_env: bool,
@@ -189,7 +202,7 @@ def _train_one(
             name = run.label
         else:
             command = f"lagros train {run.task} --algo {run.algorithm.name} --seed {run.seed}"
-            command += "" if segments is None else f" --segments {segments}"
+            command += asked
             command += "" if residual is None else f" --residual {residual:g}"
             record = train_run(run, place, lambda: lesson_of(run, parallel_env), command, tell)
             name = run.algorithm.name if residual is None else "residual"
@@ -207,8 +220,12 @@ def _train_one(
         write_atomic(home, place.weights.read_bytes())
         write_atomic(home.with_suffix(".json"), place.record.read_bytes())
         typer.echo(f"copied to {home}: they fly as the policy {name!r}")
-    else:
+    elif run.label == name:
         typer.echo(f"copy them to {home}, and they fly as the policy {name!r}")
+    else:
+        typer.echo(
+            f"lagros_policies.make({name!r}, env, weights={str(place.weights)!r}) flies them"
+        )
     return record
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 from lagros_benchmarks.report.formats import number, percent
@@ -17,7 +17,7 @@ from lagros_envs.checks import (
     check_whole,
 )
 from lagros_envs.tasks.spacecraft.scenarios import MOST_AGENTS, PRESETS
-from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings, settings_for
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,43 @@ class SpacecraftTraining(Training):
     def rows(self) -> int:
         """Agents that learn side by side."""
         return self.worlds * self.agents
+
+    @property
+    def label(self) -> str:
+        """Name of the runs that differ in the seed alone."""
+        usual = (self.preset, self.agents) == (type(self).preset, type(self).agents)
+        return super().label if usual else f"{super().label}-{self.preset}-{self.agents}"
+
+    def in_worlds(self, preset: str | None, agents: int | None) -> SpacecraftTraining:
+        """Return the run in worlds of another preset or number of agents, judged in them alone.
+
+        As many agents learn, in episodes of the same share of the time limit.
+
+        Args:
+            preset: Name of the preset; None for that of this run.
+            agents: N; None for that of the preset.
+
+        Raises:
+            ValueError: There is no such preset, or it has no worlds of so many.
+        """
+        name = self.preset if preset is None else preset
+        check_name("preset", name, PRESETS)
+        count = PRESETS[name].agents if agents is None else agents
+        check_whole("agents", count, 1, MOST_AGENTS)
+        new = settings_for(PRESETS[name].for_agents(count)).time_limit
+        old = settings_for(PRESETS[self.preset].for_agents(self.agents)).time_limit
+        return replace(
+            self,
+            preset=name,
+            agents=count,
+            worlds=max(1, round(self.rows / count)),
+            time_limit=float(round(self.time_limit * new / old)),
+            final_agents=(count,),
+            final_presets=(name,),
+            # As many agents are judged.
+            final_episodes=max(1, round(self.final_episodes * self.agents / count)),
+            curve_episodes=max(1, round(self.curve_episodes * self.agents / count)),
+        )
 
 
 class SpacecraftCourse:
