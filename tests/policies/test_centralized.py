@@ -336,3 +336,21 @@ def test_make_builds_it_for_the_spacecraft_and_names_what_there_is():
     assert action.shape == (2, 8)
     with pytest.raises(ValueError, match="centralized"):
         lagros_policies.make("lqr", env)
+
+
+@pytest.mark.parametrize(("far", "planned"), [(20.0, True), (1e3, False)])
+def test_a_goal_far_away_is_answered_by_a_plan_of_bounded_size(far, planned):
+    env, policy = built(agents=2)
+    starts = np.array([[0.0, 0.0], [0.0, 2.0]])
+    goals = starts + np.array([far, 0.0])
+    scenario = Scenario(starts, np.zeros(2), goals, [[6.0, 1.0]], [0.5])
+    env.reset(seed=0, options={"scenario": scenario})
+    action, memory = policy.predict(env.state())
+    assert np.isfinite(action).all()
+    assert memory[0].solved is planned
+    assert memory[0].plan.states.shape == (2, 61, 4)
+    if not planned:
+        # Out of reach in the time: one guess shows it, and agents hold their positions.
+        assert memory[0].plan.attempts == 1
+        assert "out of reach" in memory[0].plan.status
+        assert action == pytest.approx(0.0, abs=1e-6)

@@ -11,7 +11,7 @@ from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
 from lagros_policies.planning.local.motion import Discs
 from lagros_policies.planning.local.plan import LocalPlanner
-from lagros_policies.planning.local.problem import LocalPlannerSettings
+from lagros_policies.planning.local.problem import LocalPlannerSettings, LocalProblem
 from lagros_policies.policy import Policy
 from lagros_policies.tasks.spacecraft.distributed import DistributedTubeMpcPolicy
 
@@ -332,3 +332,44 @@ def test_the_first_plan_is_waited_for():
 def test_a_deadline_a_clock_or_a_law_that_is_none_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         DistributedTubeMpcPolicy(**arguments)
+
+
+@pytest.mark.parametrize("far", [20.0, 1e3, 1e6])
+def test_a_goal_far_away_is_answered_by_a_plan_of_bounded_size(far):
+    policy = DistributedTubeMpcPolicy(num_agents=2, deadline=1e9)
+    goal = far * np.array([0.6, -0.8])
+    row = observation(policy.layout, goal, obstacles=[(1.2, -1.6, 0.5)])
+    action, memory = policy.predict(row)
+    plan = memory[0].plan
+    assert plan.solved
+    assert np.isfinite(action).all()
+    assert plan.duration <= policy.settings.horizon
+    # In axes whose origin is the goal it ends at rest, 8 m ahead of where the agent is.
+    place, speed = plan.at(np.array([plan.duration]))
+    assert place[0] + goal == pytest.approx(8.0 * goal / far, abs=1e-6 * max(far, 10.0))
+    assert speed == pytest.approx(0.0, abs=1e-5)
+    times = np.linspace(0.0, plan.duration, 2000)
+    around = np.linalg.norm(plan.at(times)[0] + goal - [1.2, -1.6], axis=-1)
+    assert around.min() >= 0.75
+
+
+def test_a_planner_alone_is_bounded_too_however_long_its_plan():
+    settings = LocalPlannerSettings()
+    counts = []
+    for far in (8.0, 100.0, 1e4, 1e6):
+        problem = LocalProblem(settings, np.zeros(4), np.array([far, 0.0]), Discs.none(), 1.0)
+        counts.append(len(problem.times))
+    assert counts[1] == counts[2] == counts[3]
+    plan = LocalPlanner(settings).plan(np.zeros(4), np.array([1e4, 0.0]), Discs.none(), 1.0)
+    assert plan.solved
+    assert len(plan.forces) == settings.near_steps + settings.far_steps
+
+
+def test_a_goal_20_m_away_is_reached_in_parts():
+    far = Scenario([[0.0, 0.0]], [0.3], [[12.0, 16.0]], [[6.0, 8.2]], [0.5])
+    settings = SpacecraftSettings(horizon=60.0, time_limit=90.0)
+    env = spacecraft_v0.parallel_env(1, settings=settings, disturbance="none")
+    policy = DistributedTubeMpcPolicy(settings, num_agents=1, disturbance_bound=0.0, deadline=1e9)
+    states, _, info, _ = fly(env, policy, options={"scenario": far}, steps=800)
+    assert all(part["strict_success"] for part in info.values())
+    assert np.linalg.norm(states[:, 0, :2] - [6.0, 8.2], axis=-1).min() > 0.75

@@ -27,8 +27,9 @@ from lagros_policies.planning.local.motion import Discs, LocalPlan, required_dis
 from lagros_policies.planning.local.problem import LocalPlannerSettings, LocalProblem
 from lagros_policies.planning.vectors import lengths
 
-# Instants at which a plan in force is checked are at most this far apart [s].
-_CHECK_SPACING = 0.4
+# Instants at which a plan in force is checked are at most this far apart [s], as long as these are
+# enough for it.
+_CHECK_SPACING, _MOST_CHECKS = 0.4, 300
 # Look for another way when the plan in force has become dearer by this much [N^2 s].
 _DEARER = 5e-3
 
@@ -101,7 +102,8 @@ class LocalPlanner:
         if len(discs.centres) == 0:
             return 0.0
         ends = max(plan.duration - elapsed, settings.foresight)
-        times = np.linspace(0.0, ends, math.ceil(ends / _CHECK_SPACING) + 1)
+        checks = min(math.ceil(ends / _CHECK_SPACING), _MOST_CHECKS)
+        times = np.linspace(0.0, ends, checks + 1)
         places = plan.at(times + elapsed)[0]
         required = required_distances(discs, times, places[0], goal, left, settings.margin_growth)
         apart = lengths(places[:, None] - discs.at(times))

@@ -22,8 +22,9 @@ from lagros_policies.planning.local.motion import (
 from lagros_policies.planning.vectors import lengths, unit_vectors
 
 _UNBOUNDED = 1e30
-# Instants where distances are imposed: at most this far apart, near and far ahead [s].
-_NEAR_INSTANTS, _FAR_INSTANTS = 0.25, 0.5
+# Instants where distances are imposed: at most this far apart, near and far ahead [s], and no more
+# than this in one step, however long a plan is.
+_NEAR_INSTANTS, _FAR_INSTANTS, _MOST_INSTANTS = 0.25, 0.5, 24
 # A plan with a force limit is so long that this share of it would do without obstacles, found in
 # steps of this factor.
 _DIRECT_SHARE, _LONGER = 0.7, 1.1
@@ -298,7 +299,7 @@ def _instants(edges: FloatArray, settings: LocalPlannerSettings) -> tuple[FloatA
         (edges[: settings.near_steps + 1], _NEAR_INSTANTS),
         (edges[settings.near_steps :], _FAR_INSTANTS),
     ):
-        count = max(math.ceil((some[1] - some[0]) / spacing - 1e-9), 1)
+        count = min(max(math.ceil((some[1] - some[0]) / spacing - 1e-9), 1), _MOST_INSTANTS)
         share = np.arange(count) / count
         parts.append((some[:-1, None] + share * (some[1] - some[0])).ravel())
         parts.append(np.tile(share == 0.0, len(some) - 1))

@@ -21,6 +21,7 @@ from lagros_policies.planning.local.map import LocalMap
 from lagros_policies.planning.local.motion import Discs, LocalPlan
 from lagros_policies.planning.local.plan import LocalPlanner
 from lagros_policies.planning.local.problem import LocalPlannerSettings
+from lagros_policies.planning.vectors import lengths
 from lagros_policies.policy import BasePolicy, PolicyState, row_memories
 from lagros_policies.tasks.spacecraft.gain_control import tracking_law
 from lagros_policies.tasks.spacecraft.sensed import Sensed
@@ -37,6 +38,9 @@ from lagros_policies.tasks.spacecraft.setup import (
 _STILL, _STILL_NOISE = 0.04, 0.1
 # Every so many plans another way is looked for, though the one in force holds.
 _FRESH_EVERY = 5
+# Goals farther than this are planned for in parts: rest this far ahead on the straight line [m], on
+# the way to which obstacles farther than `_AROUND` do not count [m].
+_REACH, _AROUND = 8.0, 10.0
 # An agent is stuck that has not come closer by `_PROGRESS` [m] for `_PATIENCE` [s].
 _PROGRESS, _PATIENCE = 0.1, 6.0
 
@@ -88,7 +92,9 @@ class DistributedTubeMpcPolicy(BasePolicy):
 
     Every row of an observation is one agent, which knows what it senses and remembers the obstacles
     that it has seen. It plans in axes whose origin is its goal, to rest there at T or as soon after
-    as it can; takes other agents to go on as they do, for as long as the plan's short steps last;
+    as it can, or 8 m ahead where the goal is farther, in that share of the time, so that a plan and
+    the time that it takes stay bounded however far it is; takes other agents to go on as they do,
+    for as long as the plan's short steps last;
     and keeps to the right of whoever it meets. A plan begins at the *nominal* state of the last,
     not at the measured one: u* keeps the agent in the tube around one continuous target trajectory.
 
@@ -267,25 +273,32 @@ class DistributedTubeMpcPolicy(BasePolicy):
     def _confirm_or_renew(self, own: FloatArray, now: float, memory: DistributedState) -> None:
         """Keep the plan in force if it still keeps its distances, else plan anew."""
         plan, elapsed = memory.plan, memory.age * self.settings.control_period
-        left = self.settings.horizon - now
-        discs = self._discs(memory.map)
+        start = own  # of a first plan; later ones begin at the nominal state
+        if plan is not None:
+            start = np.concatenate([part[0] for part in plan.at(np.array([elapsed]))])
+        goal, left = _ahead(start[:2], self.settings.horizon - now)
+        discs = self._discs(memory.map, start[:2])
         memory.unchecked = 0
         if plan is not None and elapsed < self.kept_for - 1e-9:
-            short = self.planner.shortfall(plan, elapsed, np.zeros(2), discs, left)
+            short = self.planner.shortfall(plan, elapsed, goal, discs, left)
             if short <= self.planner.settings.tolerance:
                 memory.confirmed_plans += 1
                 return
-        self._renew(own, left, discs, memory)
+        self._renew(start, goal, left, discs, memory)
 
-    def _renew(self, own: FloatArray, left: float, discs: Discs, memory: DistributedState) -> None:
-        """Plan from the nominal state, or from the sensed one at first."""
+    def _renew(
+        self,
+        start: FloatArray,
+        goal: FloatArray,
+        left: float,
+        discs: Discs,
+        memory: DistributedState,
+    ) -> None:
+        """Plan from a state to rest at a place."""
         last, elapsed = memory.plan, memory.age * self.settings.control_period
-        start = own
-        if last is not None:
-            start = np.concatenate([part[0] for part in last.at(np.array([elapsed]))])
         fresh = memory.plans % _FRESH_EVERY == 0
         begun = self._clock()
-        plan = self.planner.plan(start, np.zeros(2), discs, left, last, elapsed, fresh)
+        plan = self.planner.plan(start, goal, discs, left, last, elapsed, fresh)
         late = self._clock() - begun > self.deadline
         memory.plans += 1
         memory.late_plans += late
@@ -297,8 +310,9 @@ class DistributedTubeMpcPolicy(BasePolicy):
         memory.infeasible_plans += plan.short > self.planner.settings.tolerance
         memory.plan, memory.age = plan, 0
 
-    def _discs(self, known: LocalMap) -> Discs:
+    def _discs(self, known: LocalMap, place: FloatArray) -> Discs:
         obstacles, neighbours = known.obstacles, known.neighbours
+        obstacles = obstacles[lengths(obstacles[:, :2] - place) <= _AROUND]
         preset = self.preset
         counts = len(obstacles), len(neighbours)
         speed = np.hypot(neighbours[:, 2], neighbours[:, 3])
@@ -314,6 +328,15 @@ class DistributedTubeMpcPolicy(BasePolicy):
             np.repeat([self.margin, PAIR_SHARE * self.margin], counts),
             np.concatenate([np.zeros(counts[0], bool), moving]),
         )
+
+
+def _ahead(place: FloatArray, left: float) -> tuple[FloatArray, float]:
+    """Return where a plan is to rest and in which time, in axes whose origin is the goal."""
+    distance = float(np.hypot(*place))
+    if distance <= _REACH:
+        return np.zeros(2), left
+    share = _REACH / distance
+    return (1.0 - share) * place, share * left
 
 
 class LeastNormTubeMpcPolicy(DistributedTubeMpcPolicy):
