@@ -41,6 +41,14 @@ ANCHOR = {
     "swarm": {128: 53.5},
 }
 ANCHOR_TIME = (100.0, 180.0)  # of an agent and step [us]
+# Colours that the colour-blind tell apart (Okabe and Ito), and marks for who sees none.
+STYLES = {
+    "swarm": ("#0072b2", "o"),
+    "swarm-45": ("#56b4e9", "X"),
+    "gcbf": ("#d55e00", "s"),
+    "gcbf-free": ("#009e73", "^"),
+    "paper": ("#000000", "D"),
+}
 
 
 class Cell(NamedTuple):
@@ -159,26 +167,36 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     """Draw success, effort and time against the number of agents."""
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, 3, figsize=(10.0, 3.2), layout="constrained")
-    kinds = list(dict.fromkeys((row["preset"], row["bound"], row["filtered"]) for row in rows))
-    for kind in kinds:
+    figure, axes = plt.subplots(1, 3, figsize=(10.0, 3.4), layout="constrained")
+    for kind in dict.fromkeys((row["preset"], row["bound"], row["filtered"]) for row in rows):
         preset, bound, filtered = kind
         line = [row for row in rows if (row["preset"], row["bound"], row["filtered"]) == kind]
-        label = f"{preset}, d̄ = {bound:g}" + ("" if filtered else ", no filter")
+        colour, marker = STYLES[preset]
+        style: dict[str, Any] = {
+            "label": f"{preset}, d̄ = {bound:g}" + ("" if filtered else ", no filter"),
+            "color": colour,
+            "marker": marker,
+            "linestyle": ":" if not filtered else "--" if bound == 1.0 else "-",
+            "fillstyle": "full" if filtered else "none",
+        }
         rate = "safe_reached_rate" if preset.startswith("gcbf") else "success_rate"
         numbers = [row["agents"] for row in line]
-        axes[0].plot(numbers, [100 * row[rate] for row in line], "o-", label=label)
-        axes[1].plot(numbers, [row["effort_mean"] for row in line], "o-")
-        axes[2].plot(numbers, [row["step_time_per_agent_us"] for row in line], "o-")
+        axes[0].plot(numbers, [100 * row[rate] for row in line], **style)
+        axes[1].plot(numbers, [row["effort_mean"] for row in line], **style)
+        axes[2].plot(numbers, [row["step_time_per_agent_us"] for row in line], **style)
     for preset, published in ANCHOR.items():
-        axes[0].plot(published.keys(), published.values(), "x--", label=f"GCBF+, {preset}, d̄ = 0")
-    axes[2].axhspan(*ANCHOR_TIME, alpha=0.3, label="GCBF+")
+        marker = STYLES[preset][1]
+        label = f"GCBF+, {preset}, d̄ = 0"
+        style = {"color": "grey", "marker": marker, "linestyle": "-.", "fillstyle": "none"}
+        axes[0].plot(list(published), list(published.values()), label=label, **style)
+    axes[2].axhspan(*ANCHOR_TIME, color="grey", alpha=0.3, label="GCBF+")
     titles = ("success [%]", "effort to success [N²s]", "Δt per agent [µs]")
     for axis, title in zip(axes, titles, strict=True):
         axis.set(xscale="log", xlabel="agents", title=title)
     axes[2].set_yscale("log")
-    axes[2].legend(fontsize=6)
-    figure.legend(fontsize=6, loc="outside lower center", ncols=4)
+    axes[2].legend(*(part[-1:] for part in axes[2].get_legend_handles_labels()), fontsize=7)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=7, loc="outside lower center", ncols=4)
     figure.savefig(path, dpi=150)
 
 
