@@ -183,10 +183,17 @@ def _spread(starts: IntArray, ends: IntArray) -> tuple[IntArray, IntArray]:
     return whose, place
 
 
+def both_ways(one: IntArray, other: IntArray) -> tuple[IntArray, IntArray]:
+    """Return pairs each both ways, in ascending order; they are given each once."""
+    ones, others = np.concatenate([one, other]), np.concatenate([other, one])
+    order = np.argsort(ones * (ones.max(initial=0) + 1) + others)
+    return ones[order], others[order]
+
+
 @lru_cache(maxsize=8)
 def all_pairs(worlds: int, agents: int) -> tuple[IntArray, IntArray]:
-    """Return every pair of agents of a world, as places in (worlds * agents,)."""
-    first, second = np.triu_indices(agents, 1)
+    """Return every pair of agents of a world both ways, as places in (worlds * agents,)."""
+    first, second = np.nonzero(~np.eye(agents, dtype=bool))
     begin = agents * np.arange(worlds)[:, None]
     return (begin + first).reshape(-1), (begin + second).reshape(-1)
 

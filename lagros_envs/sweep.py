@@ -37,8 +37,8 @@ def swept_agents(path: Path, contact: FloatArray, near: Offsets | None = None) -
     Args:
         path: How the agents moved.
         contact: Distance of centres at which two agents of a world touch, shape (worlds,) [m].
-        near: Pairs of agents, as they lie at the end, among which all are that can have met; None
-            for all pairs.
+        near: Pairs of agents, each both ways, as they lie at the end, among which all are that can
+            have met; None for all pairs.
 
     Returns:
         Shape (worlds, agents). The bulge of the paths counts as contact: a pass that is closer than
@@ -65,7 +65,6 @@ def swept_agents(path: Path, contact: FloatArray, near: Offsets | None = None) -
         offsets = flat[:, :, other] - flat[:, :, one]
         close = closest_approach(offsets) < touch[one] + curves[one] + curves[other]
         hit[one[close]] = True
-        hit[other[close]] = True
     return hit.reshape(worlds, agents)
 
 

@@ -116,6 +116,32 @@ def test_collisions_by_cells_are_those_by_all_pairs(seed):
     assert len(near.obstacles.one) < len(beside.one)
 
 
+@given(st.integers(0, 2**32), st.sampled_from([0.003, 0.05, 0.5]), st.sampled_from([0.0, 0.5, 2.0]))
+def test_who_was_near_before_is_who_is_near_as_all_move(seed, speed, sensing):
+    """Pairs are looked up anew when somebody has moved further than they allow for, not later."""
+    rng = np.random.default_rng(seed)
+    worlds, agents, discs = 2, 15, 6
+    points = rng.uniform(0.0, 6.0, (2, worlds, agents))
+    centres = rng.uniform(0.0, 6.0, (2, worlds, discs))
+    contact, radii = np.full(worlds, 0.2), np.full((worlds, discs), 0.4)
+    near = Nearby(sensing, points, points, contact, centres, radii, np.zeros(worlds), True)
+    for _ in range(12):
+        # One of them at a time is the fastest.
+        points = points + speed * rng.normal(size=points.shape) * rng.random((1, worlds, agents))
+        found = near.at(points, rng.choice([0.01, 0.1]))
+        for pairs, others, distance in (
+            (found.agents, points, max(sensing, 0.2)),
+            (found.obstacles, centres, max(sensing + 0.4, 0.4)),
+        ):
+            seen = np.flatnonzero(pairs.square <= distance * distance)
+            ones = [(int(pairs.one[k]), int(pairs.other[k])) for k in seen]
+            assert ones == sorted(set(ones))
+            truth = near_by_hand(points, others, distance)
+            if others is points:
+                truth = {pair for pair in truth if pair[0] != pair[1]}
+            assert set(ones) == truth
+
+
 def flown(monkeypatch, by_cells, preset, worlds, agents, steps=12):
     """Everything that worlds show of themselves, by cells or by all pairs."""
     monkeypatch.setattr(nearby, "MOST_PAIRS", 0 if by_cells else 10**9)

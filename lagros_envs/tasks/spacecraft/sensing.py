@@ -133,29 +133,26 @@ def observe(world: SpacecraftWorld, layout: Layout) -> Float32Array:
     if agents > 1:
         pairs = near.agents
         seen = np.flatnonzero(pairs.square <= radius**2)
-        one, other = pairs.one[seen], pairs.other[seen]
-        course = world.parts[3:5].reshape(2, -1)
-        values = np.empty((2, len(seen), NEIGHBOUR_DIM), np.float32)
-        values[0, :, 0], values[0, :, 1] = pairs.x[seen], pairs.y[seen]
-        values[0, :, 2:] = (course[:, other] - course[:, one]).T
-        # Each sees the other, the opposite way.
-        np.negative(values[0], out=values[1])
-        whose, whom = np.concatenate([one, other]), np.concatenate([other, one])
-        which = whom % agents if worlds > 1 else whom.copy()
-        which -= whom > whose
+        whose, whom = pairs.one.take(seen), pairs.other.take(seen)
+        values = np.empty((len(seen), NEIGHBOUR_DIM), np.float32)
+        values[:, 0], values[:, 1] = pairs.x.take(seen), pairs.y.take(seen)
+        for column, speed in ((2, velocity_x.reshape(-1)), (3, velocity_y.reshape(-1))):
+            values[:, column] = speed.take(whom) - speed.take(whose)
+        number = np.arange(worlds * agents) % agents
+        which = number.take(whom) - (whom > whose)
         slots = _Slots(at["neighbours"], at["neighbour_mask"], agents - 1)
-        distances = np.concatenate([pairs.square[seen]] * 2)
-        slots.fill(rows, whose, which, values.reshape(-1, NEIGHBOUR_DIM), distances)
+        slots.fill(rows, whose, which, values, pairs.square.take(seen))
     if world.obstacles:
         pairs, radii = near.obstacles, world.obstacle_radii.reshape(-1)
         # -inf where there is no obstacle: its square must not count.
         reach = np.maximum(radii + radius, -1.0)
         seen = np.flatnonzero(pairs.square <= (reach * np.abs(reach)).take(pairs.other))
-        whose, disc = pairs.one[seen], pairs.other[seen]
+        whose, disc = pairs.one.take(seen), pairs.other.take(seen)
+        size = radii.take(disc)
         discs = np.empty((len(seen), OBSTACLE_DIM), np.float32)
-        discs[:, 0], discs[:, 1], discs[:, 2] = pairs.x[seen], pairs.y[seen], radii[disc]
+        discs[:, 0], discs[:, 1], discs[:, 2] = pairs.x.take(seen), pairs.y.take(seen), size
         slots = _Slots(at["obstacles"], at["obstacle_mask"], world.obstacles)
-        rims = np.sqrt(pairs.square[seen]) - radii[disc]
+        rims = np.sqrt(pairs.square.take(seen)) - size
         slots.fill(rows, whose, disc % world.obstacles, discs, rims)
     return rows.reshape(worlds, agents, -1)
 
@@ -189,22 +186,20 @@ class _Slots(NamedTuple):
 
         Args:
             rows: The observations, shape (rows, size), in which nothing is sensed yet.
-            whose: The row that senses, shape (p,).
-            which: The number of what it senses among those of its world, shape (p,).
+            whose: The row that senses, ascending, shape (p,).
+            which: The number of what it senses among those of its world, likewise for each row.
             values: What is to be seen of it, shape (p, numbers).
             distances: In whose order they are nearest, shape (p,).
         """
         count, size = rows.shape
         room = self.mask.stop - self.mask.start
         if room < self.most:
-            order = np.argsort(whose * self.most + which)
-            place = _places_among(whose[order], count)
-            if place.size and place.max() >= room:
+            which = _places_among(whose, count)
+            if which.max(initial=0) >= room:
                 order = np.lexsort((distances, whose))
-                order = order[_places_among(whose[order], count) < room]
-                order = order[np.argsort(whose[order] * self.most + which[order])]
-                place = _places_among(whose[order], count)
-            whose, which, values = whose[order], place, values[order]
+                order = np.sort(order[_places_among(whose[order], count) < room])
+                whose, values = whose[order], values[order]
+                which = _places_among(whose, count)
         flat, begin, dim = rows.reshape(-1), whose * size, values.shape[1]
         flat[begin + (self.mask.start + which)] = 1.0
         begin += self.slots.start + dim * which
