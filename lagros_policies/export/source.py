@@ -11,7 +11,7 @@ from typing import Any
 from lagros_envs.arrays import Float32Array
 from lagros_envs.checks import shown
 from lagros_envs.registry import find_task, task_names
-from lagros_envs.task import Described
+from lagros_envs.task import Described, Task
 from lagros_policies.export.program import Program
 from lagros_policies.policy import BasePolicy
 from lagros_policies.room import found_file, imported, named_in, part_of
@@ -104,12 +104,15 @@ def load_source(name: str, weights: Path | str | None = None, **told: Any) -> So
         ValueError: The name is unknown, or the file is damaged or another network.
     """
     short, task = parted(name)
-    if weights is None:
-        weights = found_file(task, f"{short}.safetensors")
     place = named_in(task, "POLICIES", {}).get(short, _POLICIES[short])
-    policy: BasePolicy = imported(place)(task, weights=weights, **told)
+    # Worlds of many agents bring settings with their preset, unless somebody has chosen others.
+    usual = not isinstance(task, Task) and task == type(task)()
+    policy: BasePolicy = imported(place)(None if usual else task, weights=weights, **told)
     parts: Exported = part_of(task, "EXPORT", "lagros_policies.export.single:exported")(policy)
-    path = Path(weights)
+    # Which file ships may depend on the world: the policy knows which one it took.
+    path = Path(
+        weights or getattr(policy, "weights_path", None) or found_file(task, f"{short}.safetensors")
+    )
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     return Source(
         **vars(parts), name=f"{short}-{task.name}", file=path.name, digest=digest, policy=policy

@@ -1,6 +1,7 @@
 """Exported spacecraft policies: C by gcc and ONNX by ONNX Runtime, against NumPy and symmetry."""
 
 import ctypes
+import hashlib
 import itertools
 import subprocess
 
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
+from lagros_policies import make
 from lagros_policies.export import check, load_source
 from lagros_policies.export.c99 import c_file
 from lagros_policies.export.onnx import onnx_file
 from lagros_policies.learning.deep_set import DeepSet
+from lagros_policies.room import PRETRAINED
 
 needs_compiler = pytest.mark.skipif(check.compiler() is None, reason="no C compiler")
 needs_onnx = pytest.mark.skipif(not check.has_onnxruntime(), reason="no onnxruntime")
@@ -243,6 +246,21 @@ def test_c_of_any_network(tmp_path, widths):
         assert check.agreement(compiled.answer(rows), source, rows).relative < 2e-6
     if check.has_onnxruntime():
         assert check.check_onnx(onnx_file(source), source, 200).relative < 2e-6
+
+
+@pytest.mark.parametrize(
+    ("preset", "agents"), [("swarm", 6), ("swarm", 32), ("swarm-45", 32), ("gcbf", 8)]
+)
+def test_what_is_exported_is_what_flies_in_such_a_world(preset, agents):
+    source = load_source("lagros-spacecraft", preset=preset, num_agents=agents)
+    env = SpacecraftVectorEnv(agents, agents, preset)
+    flown = make("lagros", env)
+    rows, _ = env.reset(seed=[0])
+    np.testing.assert_array_equal(source.answer(rows), flown.thrust(rows).astype(np.float32))
+    assert source.policy.settings == flown.settings
+    wanted = "spacecraft_lagros.safetensors", "spacecraft_crowds.safetensors"
+    assert source.file == wanted[flown.receding is not None]
+    assert source.digest == hashlib.sha256((PRETRAINED / source.file).read_bytes()).hexdigest()
 
 
 @needs_compiler

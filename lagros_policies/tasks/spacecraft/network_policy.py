@@ -55,6 +55,7 @@ class SpacecraftActor(BasePolicy):
         maker: The command that makes one.
         trained_in: Presets whose bodies it has met, where the file does not say.
         recorded_as: The policy that the file must name; None takes any.
+        weights_path: The file that was read; None of a network that was handed over.
     """
 
     kind: type[DeepSet] | type[Mlp]
@@ -63,6 +64,7 @@ class SpacecraftActor(BasePolicy):
     trained_in: tuple[str, ...] = PUBLISHED
     weights_file: str
     recorded_as: str | None = None
+    weights_path: Path | None
     network: Any
     restricted = True  # `policy.make` tells it whether other settings are allowed
 
@@ -79,6 +81,7 @@ class SpacecraftActor(BasePolicy):
         given = PRETRAINED / self._shipped() if weights is None else weights
         ready = isinstance(given, self.kind)
         what = "the network" if ready else str(given)
+        self.weights_path = None if ready else Path(cast(Path, given))
         self.network = given if ready else self.kind.load(cast(Path, given))
         if (self.network.inputs, self.network.outputs) != self.maps:
             raise ValueError(
