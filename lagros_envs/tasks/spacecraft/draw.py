@@ -36,7 +36,7 @@ COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY_BLUE, YELLOW)
 BODY = 0.62  # half the side of the body, as a share of the agent's radius
 PLUME = 1.7  # length of a plume at the thrust scale, as a share of the agent's radius
 CROWD = 64  # more agents than this are drawn as discs, goals as points, with trails that fade
-TAIL = 12  # frames of a crowd's trails
+TAIL = 4  # frames of a crowd's trails
 TUBE_PERIOD = 0.5  # from disc to disc of a planned tube [s]
 # For each thruster, in the body's axes and in units of half the body: where it sits, and where its
 # plume points. The plume leaves against the force.
@@ -144,16 +144,16 @@ class SpacecraftRenderer(Canvas):
         arrived, collided = np.isfinite(world.success_time[0]), world.collided[0]
         for agent, goal in enumerate(self._points(world.goals[:, 0])):
             if not arrived[agent]:
-                draw.circle(canvas, mix(self._colour(agent), 0.45), goal, 0.5 * size)
+                draw.circle(canvas, mix(BLUE, 0.3), goal, 0.4 * size)
         tails = [self._points(places.T) for _, places in self._trail[-TAIL:]]
         if len(tails) > 1:
             for agent, tail in enumerate(zip(*tails, strict=True)):
-                draw.lines(canvas, mix(self._colour(agent), 0.5), False, tail, OVERSAMPLING)
+                if not arrived[agent]:
+                    draw.lines(canvas, mix(BLUE, 0.5), False, tail, OVERSAMPLING)
+        # What has happened to them: of so many, nobody follows one by its colour.
         for agent, place in enumerate(self._points(world.parts[:2, 0])):
-            colour = VERMILLION if collided[agent] else self._colour(agent)
+            colour = VERMILLION if collided[agent] else GREEN if arrived[agent] else BLUE
             draw.circle(canvas, colour, place, size)
-            if arrived[agent]:
-                draw.circle(canvas, BLACK, place, size, max(1, round(0.3 * size)))
 
     def _points(self, places: FloatArray) -> list[Point]:
         """Return where places (2, n) are on the canvas."""
@@ -296,9 +296,9 @@ class SpacecraftRenderer(Canvas):
         ]
         if world.agents > CROWD:
             keys = [
-                ("disc", mix(BLUE, 0.45), "goal"),
+                ("disc", mix(BLUE, 0.3), "goal"),
                 ("disc", BLUE, "on its way"),
-                ("rim", BLUE, "arrived"),
+                ("disc", GREEN, "arrived"),
                 ("disc", VERMILLION, "collided"),
                 ("disc", mix(GREY, 0.75), "obstacle"),
             ]
