@@ -75,6 +75,7 @@ CELLS = tuple(
         ("swarm-45", (32,), 0.4, True),
         ("gcbf", (8, 32, 128, 512, 1024), 0.4, True),
         ("gcbf", (8, 32, 128, 512, 1024), 1.0, True),
+        ("gcbf", (8,), 0.4, False),
         ("gcbf-free", (8, 32, 128), 0.4, True),
         ("paper", (6,), 0.4, True),
     )
