@@ -31,6 +31,7 @@ from lagros_envs.tasks.spacecraft.scenarios import PRESETS
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 
 _STEPS = 20
+_SPEED = 0.4  # of agents on their way [m/s]
 _SIZES = "1x128,1x512,1x1024,64x32,256x6"
 _COUNTS = (4, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 
@@ -143,12 +144,16 @@ def looking(worlds: int, agents: int, preset: str, by_cells: bool) -> Callable[[
         world.core_radius,
         by_cells,
     )
-    points = world.parts[:2].copy()
+    points = world.parts[:2]
+    # As they fly: what is found is looked at again until somebody has moved too far.
+    angle = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, points.shape[1:])
+    move = _SPEED * env.settings.control_period * np.array([np.cos(angle), np.sin(angle)])
+    way = [points + step * move for step in range(_STEPS)]
 
     def look() -> float:
         begun = process_time()
-        for _ in range(_STEPS):
-            nearby.at(points, 0.05)
+        for places in way:
+            nearby.at(places, 0.05)
         return (process_time() - begun) / _STEPS
 
     return look
@@ -184,7 +189,8 @@ def main() -> None:
             f"--sizes {wanted.sizes} --preset {wanted.preset} --rounds {wanted.rounds}"
             f"{' --plain' if wanted.plain else ''}"
         )
-        record = {"command": command, "load": os.getloadavg()[0], "rows": rows}
+        record: dict[str, Any] = {"command": command, "clock": "processor time"}
+        record |= {"load": os.getloadavg()[0], "rows": rows}
         write_atomic(wanted.json, json.dumps(record, indent=1) + "\n")
 
 
