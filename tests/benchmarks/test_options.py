@@ -175,6 +175,8 @@ TRAIN = {
     "--out": Row(FOLDERS),
     "--segments": Row((*POSITIVE_WHOLE, "65536")),
     "--residual": Row((*POSITIVE, "41"), CARTPOLE, SPACECRAFT, "4"),
+    "--preset": Row(NAMES, SPACECRAFT, CARTPOLE, "open"),
+    "--agents": Row(POSITIVE_WHOLE, SPACECRAFT, CARTPOLE, "3"),
     "--parallel-env": Row(FLAG, SPACECRAFT, CARTPOLE),
     "--tensorboard": Row(FLAG),
     "--quiet": Row(FLAG),

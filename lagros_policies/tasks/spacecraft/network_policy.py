@@ -81,8 +81,8 @@ class SpacecraftActor(BasePolicy):
         given = PRETRAINED / self._shipped() if weights is None else weights
         ready = isinstance(given, self.kind)
         what = "the network" if ready else str(given)
-        self.weights_path = None if ready else Path(cast(Path, given))
         self.network = given if ready else self.kind.load(cast(Path, given))
+        self.weights_path = None if ready else Path(cast(Path, given))
         if (self.network.inputs, self.network.outputs) != self.maps:
             raise ValueError(
                 f"{what} maps {self.network.inputs} numbers to {self.network.outputs}; this agent "
