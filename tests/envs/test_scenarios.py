@@ -51,7 +51,8 @@ def test_every_preset_samples_what_it_promises(name):
         assert sample.num_agents == preset.agents
         assert (sample.agent_radius, sample.core) == (preset.agent_radius, preset.core)
         assert preset.obstacle_count[0] <= len(sample.obstacles) <= preset.obstacle_count[1]
-        assert np.all(np.linalg.norm(sample.starts - sample.goals, axis=1) >= preset.least_way)
+        ways = np.linalg.norm(sample.starts - sample.goals, axis=1)
+        assert np.all((ways >= preset.least_way) & (ways <= preset.longest_way + 1e-12))
         room = 2.0 * (sample.agent_radius + preset.margin)
         assert np.all(apart(sample.starts) >= room - 1e-12)
         assert np.all(apart(sample.goals) >= room - 1e-12)
@@ -89,6 +90,8 @@ def test_crossing_swaps_opposite_places(agents):
         np.testing.assert_allclose(sample.starts + sample.goals, 2.0 * middle + 0 * sample.starts)
         radii = np.linalg.norm(sample.starts - middle, axis=1)
         np.testing.assert_allclose(radii, radii[0])
+        way = PRESETS["crossing"].for_agents(agents).longest_way
+        np.testing.assert_allclose(2.0 * radii, way)
         if agents > 1:
             assert np.min(apart(sample.starts)) >= 0.8 - 1e-9
 

@@ -8,11 +8,11 @@ import pytest
 from lagros_envs.balls import onto_unit_sphere
 from lagros_envs.tasks.spacecraft.scenarios import PRESETS, Preset
 from lagros_envs.tasks.spacecraft.sensing import Layout
-from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings, settings_for
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.policy import BasePolicy
 from lagros_policies.safety.reserve import zones_beside_bodies
-from lagros_policies.tasks.spacecraft import proved_filter
+from lagros_policies.tasks.spacecraft import proved_filter, reserved
 from lagros_policies.tasks.spacecraft.proved_filter import ProvedFilter
 from lagros_policies.tasks.spacecraft.reserved import (
     ReserveSettings,
@@ -268,15 +268,50 @@ def test_starts_are_covered_up_to_a_bound_and_no_farther():
     assert 0.0 < limited[0] < limited[1] < most
 
 
+def test_the_bounds_are_for_any_number_of_steps(monkeypatch):
+    """Each step's worst push, summed over as many steps as the longest episodes have."""
+    task = dataclasses.replace(TASK, time_limit=588.0)
+    found = reserved_for(task, PAPER, BOUND)
+    gain, h, beta = found.gain, task.control_period, found.reserve.stopping_time
+    size, powers = np.zeros(2), np.eye(2)
+    for _ in range(task.steps):
+        for index, row in enumerate(([1.0, 0.0], [1.0, beta])):
+            place, speed = np.array(row) @ powers
+            size[index] += BOUND * np.hypot(h * place, 0.5 * h * h * place + h * speed)
+        powers = powers @ gain.step
+    bounds = np.array([found.reserve.place_error, found.reserve.stop_error])
+    assert np.all(size < bounds)
+    assert np.all(size > 0.75 * bounds)
+    # Where the sums end changes nothing but how much is lost there: little, and never a gain.
+    monkeypatch.setattr(reserved, "_LAGS", 12)
+    reserved_for.cache_clear()
+    shorter = reserved_for(task, PAPER, BOUND, ReserveSettings(pole=0.1)).reserve
+    monkeypatch.undo()
+    reserved_for.cache_clear()
+    longer = reserved_for(task, PAPER, BOUND, ReserveSettings(pole=0.1)).reserve
+    assert longer.place_error <= shorter.place_error < 1.01 * longer.place_error
+
+
+@pytest.mark.parametrize(("name", "agents"), [("paper", 6), ("swarm", 1024), ("gcbf", 1024)])
+def test_nobody_comes_farther_than_is_proved(name, agents):
+    """From the start, at the largest speed of nominal motions alone."""
+    preset = PRESETS[name].for_agents(agents)
+    task = settings_for(preset)
+    found = reserved_for(task, preset, 0.2)
+    assert found.holds
+    assert found.farthest > preset.longest_way + task.time_limit * found.speed
+
+
 @pytest.mark.parametrize(
     ("settings", "bound", "reserve"),
     [
         (dataclasses.replace(TASK, thrust_limit=0.5), 0.4, None),
         (dataclasses.replace(TASK, sensing_radius=1.0), 0.4, None),
+        (dataclasses.replace(TASK, speed_limit=1.0), 0.4, None),
         (TASK, 0.4, ReserveSettings(stopping_time=0.4)),
         (TASK, 20.0, None),
     ],
-    ids=["thrust", "sensing", "stop", "bound"],
+    ids=["thrust", "sensing", "speed", "stop", "bound"],
 )
 def test_what_is_not_proved_is_refused(settings, bound, reserve):
     env = worlds(PAIR, "none", 1)

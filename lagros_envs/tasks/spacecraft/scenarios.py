@@ -118,6 +118,18 @@ class Preset:
         """Room that starts and goals keep beside obstacles [m]."""
         return self.margin if self.obstacle_margin is None else self.obstacle_margin
 
+    @property
+    def ring(self) -> float:
+        """Radius of the circle of "antipodal", wide enough for all [m]."""
+        apart = 2.0 * (self.agent_radius + self.margin)
+        least = 0.5 * apart / math.sin(math.pi / self.agents) if self.agents > 1 else 0.0
+        return max(0.5 * self.arena - self.agent_radius - self.margin, least)
+
+    @property
+    def longest_way(self) -> float:
+        """No goal is farther from its start [m]."""
+        return 2.0 * self.ring if self.layout == "antipodal" else math.sqrt(2.0) * self.arena
+
     def most_neighbours(self, radius: float) -> int:
         """Return how many others fit around an agent, within a radius [m], while none touch."""
         return most_apart_in_disc(radius, 2.0 * self.agent_radius) - 1
@@ -352,11 +364,8 @@ def _let_out(
 
 
 def _opposite_ends(preset: Preset, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Place the agents on a circle in the middle of the arena, wide enough for all of them."""
-    apart = 2.0 * (preset.agent_radius + preset.margin)
-    least = 0.5 * apart / math.sin(math.pi / preset.agents) if preset.agents > 1 else 0.0
-    radius = max(0.5 * preset.arena - preset.agent_radius - preset.margin, least)
+    """Place the agents on a circle in the middle of the arena."""
     angles = 2.0 * math.pi * (rng.random() + np.arange(preset.agents) / preset.agents)
-    arms = radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    arms = preset.ring * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     middle = np.full(2, 0.5 * preset.arena)
     return middle + arms, middle - arms

@@ -204,6 +204,7 @@ class ProvedFilter(ActionFilter):
         outside: BoolArray = np.hypot(*nominal.place.T) > reserve.place_error + room
         outside |= np.hypot(*off.T) > reserve.stop_error + room
         outside |= np.hypot(*nominal.speed.T) > self.reserved.speed * (1.0 + 1e-6)
+        outside |= np.hypot(*sensed.goal.T) > self.reserved.farthest
         between = sensed.neighbours[..., :2]
         length = reserve.distance(preset.agent_radius, preset.agent_radius)
         apart = np.hypot(between[..., 0], between[..., 1])

@@ -4,11 +4,14 @@ The error e = (p - p_n, v - v_n) of a nominal motion that is tracked by a = a_n 
 `world_tube`, e' = (F + g K) e + E d + g n + r: d is held over the step as the environment holds it,
 n is what single precision does, r what the turn of the body does within the hold. The filter bounds
 what r needs: the nominal acceleration, the spin and its rate. Moving the nominal motion towards the
-actual one makes e smaller, but for rounding, so that the sums over the past stay bounds.
+actual one makes e smaller, but for rounding, so that the sums over the past stay bounds. They end
+at some lag: what came in before has left an error within the bounds of all times, which are assumed
+and come out no larger. So an episode may have any number of steps.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -28,11 +31,11 @@ from lagros_policies.safety.reserve import Reserve
 from lagros_policies.tasks.spacecraft.held_turn import turned as turned_by
 from lagros_policies.tasks.spacecraft.world_tube import thrust_rounding
 
-# For whom it is proved: no farther from the goal than this [m], for so many control steps.
-_FAR, _STEPS = 200.0, 1000
-# Relative: what single precision rounds, and more than double precision does.
-_SINGLE, _DOUBLE = 2.0**-24, 1e-13
-# What rounding does to headings, squared periods of it included [rad].
+# Lags of the sums over the past.
+_LAGS = 1000
+# Relative: twice what single precision rounds, as a difference has two; more than double precision.
+_SINGLE, _DOUBLE = 2.0**-23, 1e-13
+# What rounding does to headings beyond what their size makes of it [rad].
 _TURNED = 1e-6
 # What double precision and the solution of the projection may add up to [m].
 _SOLVED = 1e-5
@@ -83,6 +86,8 @@ class Reserved:
         command: Bound of the commanded acceleration [m/s^2].
         speed: Of the nominal motion, at most [m/s].
         speed_error: Bound of ||v - v_n|| at the control instants [m/s].
+        farthest: From its goal, and from the origin, no agent comes farther within the time limit,
+            if its goal is no farther from its start than any that the preset draws [m].
         covers_starts: Whether every start that the preset draws lies in the set that is kept.
         statements: What must hold, each proved or not.
     """
@@ -93,6 +98,7 @@ class Reserved:
     command: float
     speed: float
     speed_error: float
+    farthest: float
     covers_starts: bool
     statements: tuple[Statement, ...] = field(repr=False)
 
@@ -104,13 +110,18 @@ class Reserved:
 
 @dataclass(frozen=True)
 class _Errors:
-    """Bounds of the error at the instants, of what is commanded, and of ||p - p_n|| in between."""
+    """Bounds of the error at the instants, of what is commanded, and of what is in between.
+
+    There it is ||p - p_n||, ||v|| and the distance from the goal.
+    """
 
     place: float
     speed: float
     stop: float
     command: float
     inside: float
+    pace: float
+    farthest: float
 
 
 def _outputs(gain: AxisGain, middle: Interval, stopping_time: float) -> Interval:
@@ -131,7 +142,12 @@ def _outputs(gain: AxisGain, middle: Interval, stopping_time: float) -> Interval
 
 
 def _errors(
-    task: SpacecraftSettings, gain: AxisGain, settings: ReserveSettings, bound: float, speed: float
+    task: SpacecraftSettings,
+    gain: AxisGain,
+    settings: ReserveSettings,
+    bound: float,
+    speed: float,
+    way: float,
 ) -> _Errors | None:
     """Bound the error of a nominal motion; None where no bounds are found.
 
@@ -141,25 +157,32 @@ def _errors(
         settings: What the filter may do.
         bound: d_bar.
         speed: Of the nominal motion, at most [m/s].
+        way: From the start to the goal, and from the origin to both, at most [m].
     """
     if SUBSTEPS != 2:
         raise ValueError("the position is bounded for two substeps in a hold")
     bound = bound * (1.0 + SUM)
     middle = exact(gain.period) * 0.5
-    past = AxisPast(gain, _outputs(gain, middle, settings.stopping_time), _STEPS)
-    turned = turned_by(past.response.rows[:, :_STEPS], gain.period)
+    past = AxisPast(gain, _outputs(gain, middle, settings.stopping_time), _LAGS)
+    turned = turned_by(past.response.rows[:, :_LAGS], gain.period)
     angles = np.array([0.0, settings.spin, settings.spin_rate])
-    delta = turned.angles(bound, angles, _TURNED)
+    off = _TURNED + _SINGLE * (np.pi + settings.spin * task.time_limit)
+    delta = turned.angles(bound, angles, off)
     sizes = np.array([[0.0, 0.0, settings.acceleration]])
     for _ in range(_ROUNDS):
-        sensed = _SINGLE * (np.array([[_FAR, speed]]) + sizes[:, :2]) + _DOUBLE * _FAR
+        # In a hold, too: but for the turn of the body a velocity lies between those at its ends.
+        pace = speed + float(sizes[0, 1]) + gain.period * float(sizes[0, 2] * np.max(delta))
+        far = way + task.time_limit * (pace + bound)
+        sensed = _SINGLE * np.array([[far, pace]]) + _DOUBLE * far
         push = sizes[:, 2]
         noise = sensed @ np.abs(gain.gain) + thrust_rounding(task.system, push, angles[2])[0]
-        come = turned.come(past.push, push, bound, angles, delta, _TURNED)
+        come = turned.come(past.push, push, bound, angles, delta, off)
         come += past.control * noise[:, None, None]
         # What is measured of an error that is set to zero.
         come += np.einsum("qjx,nx->nqj", np.abs(past.response.rows[:, 1:]), sensed)
-        found = past.bounds(come, sensed, sizes[:, :2]).max(axis=-1)
+        errors = sizes[:, :2]
+        later = past.bounds(come, errors, errors)[..., -1]
+        found = np.maximum(past.bounds(come, sensed, errors).max(axis=-1), later)
         largest = found[:, :3] + np.concatenate([sensed, noise[:, None]], axis=1)
         largest[:, 2] += settings.acceleration
         if np.all(largest <= sizes):
@@ -177,6 +200,8 @@ def _errors(
                 (float(found[0, 3]) + float(sensed[0, 0] + sensed[0, 1])) * (1.0 + SUM),
                 command,
                 (within + bulge + _SOLVED) * (1.0 + SUM),
+                pace,
+                far * (1.0 + SUM),
             )
         sizes = np.maximum(sizes, largest * _RAISE)
         if not np.all(sizes < _HOPELESS):
@@ -281,10 +306,12 @@ def _reserved(
     gain = double_pole(pole, h)
     # Braking takes v / (beta + h/2).
     speed = settings.acceleration * (beta + 0.5 * h)
-    errors = _errors(task, gain, settings, bound, speed)
+    way = max(math.sqrt(2.0) * preset.arena, preset.longest_way)
+    errors = _errors(task, gain, settings, bound, speed, way)
     if errors is None:
         return None
-    reserve = Reserve(h, beta, errors.inside, errors.place, errors.stop, _SINGLE * _FAR + _SOLVED)
+    rounding = _SINGLE * errors.farthest + _SOLVED
+    reserve = Reserve(h, beta, errors.inside, errors.place, errors.stop, rounding)
     length = reserve.distance(preset.agent_radius, preset.agent_radius)
     # Of a body and of all that it reserves or passes until the next instant.
     reach = errors.place + (h + beta) * speed + reserve.rounding
@@ -301,6 +328,10 @@ def _reserved(
         (
             "the thrusters have that beside the torque, at every heading",
             task.thrust_limit is None or errors.command <= _most_acceleration(task, settings),
+        ),
+        (
+            f"the speed of {at_most(errors.pace)} m/s is not limited",
+            task.speed_limit is None or errors.pace <= task.speed_limit,
         ),
         (
             f"the spin stays below {settings.spin:g} rad/s",
@@ -324,6 +355,7 @@ def _reserved(
         errors.command,
         speed,
         errors.speed,
+        errors.farthest,
         bool(preset.margin >= reserve.clearance + reserve.rounding),
         tuple(Statement(text, "proved", bool(holds), seconds) for text, holds in within),
     )
