@@ -192,5 +192,11 @@ def pool(
         sums[:] = np.dot((owner == np.arange(len(sums))[:, None]) * weight, values)
         return
     values *= weight[:, None]
-    begins = np.flatnonzero(np.diff(owner, prepend=-1))
-    sums[owner[begins]] = np.add.reduceat(values, begins, axis=0)
+    # All first rows of an owner together, then all second: few steps, where nobody senses many. The
+    # first comes last, as in NumPy's own sums.
+    counts = np.bincount(owner, minlength=len(sums))
+    first = np.cumsum(counts) - counts
+    most = counts.max(initial=0)
+    for place in (*range(1, most), 0)[:most]:
+        whose = np.flatnonzero(counts > place)
+        sums[whose] += values[first[whose] + place]

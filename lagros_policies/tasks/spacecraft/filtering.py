@@ -15,7 +15,6 @@ from lagros_envs.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from lagros_envs.tasks.spacecraft import task
 from lagros_envs.tasks.spacecraft.scenarios import Preset
 from lagros_envs.tasks.spacecraft.sensing import Layout
-from lagros_policies.observed import as_numbers
 from lagros_policies.policy import BasePolicy, Policy, PolicyState, as_policy
 from lagros_policies.safety.barrier import BarrierSettings
 from lagros_policies.tasks.spacecraft.sensed import Sensed, WorldState
@@ -177,19 +176,20 @@ class ActionFilter(BasePolicy):
             ValueError: The observation, the state or the inner action has a wrong shape, or is not
                 finite.
         """
-        rows = np.atleast_2d(as_numbers(observation, np.float64))
         if self.observes == "local":
-            sensed = Sensed.of(self.layout, rows)
+            sensed = Sensed.of(self.layout, observation)
+            rows = len(sensed.time)
         else:
             slots = max(1, self.preset.obstacle_count[1])
-            world = WorldState.of(self.preset.agents, slots, rows)
+            world = WorldState.of(self.preset.agents, slots, observation)
             sensed = world.sensed(self.settings.sensing_radius)
-        inner, counts, memory = self._remembered(state, len(rows), episode_start)
+            rows = len(world.time)
+        inner, counts, memory = self._remembered(state, rows, episode_start)
         wanted, inner = self.policy.predict(observation, inner, episode_start, deterministic)
         actions = self._checked(wanted, len(sensed.time))
         filtered, changed, infeasible, memory = self._filtered(actions, sensed, memory)
         seen = np.stack([np.ones_like(changed), changed, infeasible], axis=-1)
-        counts = counts + seen.reshape(len(rows), -1, len(COUNTERS)).sum(axis=1)
+        counts = counts + seen.reshape(rows, -1, len(COUNTERS)).sum(axis=1)
         return filtered.reshape(np.shape(wanted)), FilterState(inner, counts, memory)
 
     def counters(self, state: PolicyState) -> dict[str, int]:

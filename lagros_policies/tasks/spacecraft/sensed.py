@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,15 @@ from lagros_envs.tasks.spacecraft.task import STATE_DIM
 from lagros_policies.observed import as_numbers
 from lagros_policies.tasks.spacecraft.setup import PLANE
 
+# Up to so many slots it takes longer to find those in use than to look at all.
+_FEW = 16
+
 
 class Sensed(NamedTuple):
     """The observations o_l of some agents, by parts; B rows, k neighbours, m obstacles.
 
-    Slots of what is not sensed are zero, and so is their mask. The parts are views: policies that
-    decide within microseconds take only those that they need.
+    Slots of what is not sensed are zero, and so is their mask. Where an observation has many, those
+    after the last that anybody uses are left out, but one.
 
     Attributes:
         own: What an agent knows of itself, shape (B, 9); its columns have names below.
@@ -91,13 +94,14 @@ class Sensed(NamedTuple):
             f"with {layout.neighbours} neighbours and {layout.obstacles} obstacles at most it has "
             f"{layout.size} numbers: build the policy with the environment's preset and num_agents",
         )
-        at, count = layout.slices, len(rows)
+        at = layout.slices
+        others, discs = (_used(rows, at[name]) for name in ("neighbour_mask", "obstacle_mask"))
         return cls(
-            rows[:, : at["neighbours"].start],
-            rows[:, at["neighbours"]].reshape(count, -1, NEIGHBOUR_DIM),
-            rows[:, at["neighbour_mask"]] > 0.0,
-            rows[:, at["obstacles"]].reshape(count, -1, OBSTACLE_DIM),
-            rows[:, at["obstacle_mask"]] > 0.0,
+            rows[:, : at["neighbours"].start].astype(np.float64),
+            _bodies(rows, at["neighbours"], NEIGHBOUR_DIM, others),
+            others,
+            _bodies(rows, at["obstacles"], OBSTACLE_DIM, discs),
+            discs,
         )
 
 
@@ -144,7 +148,8 @@ class WorldState(NamedTuple):
             "numbers: build the policy with the environment's preset and num_agents, and its "
             "filter too",
         )
-        time, states, goals, discs, mask = np.split(rows, ends[:-1], axis=1)
+        parts = np.split(rows.astype(np.float64), ends[:-1], axis=1)
+        time, states, goals, discs, mask = parts
         if not np.isin(mask, (0.0, 1.0)).all():
             raise ValueError(
                 f"the observation is not the state() of {agents} agents and up to {obstacles} "
@@ -196,9 +201,26 @@ class WorldState(NamedTuple):
         )
 
 
-def _rows(observation: NDArray[np.floating], size: int, wanted: str) -> FloatArray:
-    """Return observations as rows; `wanted` says what they must be."""
-    rows = as_numbers(observation, np.float64)
+def _used(rows: NDArray[Any], mask: slice) -> BoolArray:
+    """Return a mask, (B, slots), of many slots without those that come after the last in use."""
+    present: BoolArray = rows[:, mask] > 0.0
+    if present.shape[1] <= _FEW:
+        return present
+    used = np.flatnonzero(present.any(axis=0))
+    return present[:, : used[-1] + 1 if used.size else 1]
+
+
+def _bodies(rows: NDArray[Any], at: slice, numbers: int, mask: BoolArray) -> FloatArray:
+    """Return the slots of a mask, each of so many numbers, shape (B, slots, numbers)."""
+    slots = mask.shape[1]
+    taken = rows[:, at.start : at.start + numbers * slots].astype(np.float64)
+    return taken.reshape(len(rows), slots, numbers)
+
+
+def _rows(observation: Any, size: int, wanted: str) -> NDArray[Any]:
+    """Return observations as rows of their own precision; `wanted` says what they must be."""
+    single = type(observation) is np.ndarray and observation.dtype == np.float32
+    rows: NDArray[Any] = observation if single else as_numbers(observation, np.float64)
     if rows.ndim == 1:
         rows = rows[None]
     if rows.ndim != 2 or rows.shape[1] != size:
