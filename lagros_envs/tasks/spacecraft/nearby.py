@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -22,18 +23,32 @@ _MARGIN = 0.1
 _USED = 0.99
 
 
-class Near(NamedTuple):
+@dataclass(frozen=True)
+class Near:
     """What may be near each other at an instant: all that is sensed, and all that can have met.
 
     Attributes:
         points: Where the agents are, shape (2, worlds, agents) [m].
-        agents: Pairs of agents of a world, each both ways, in ascending order.
-        obstacles: Pairs of an agent and an obstacle of its world, in ascending order.
+        centres: Where the obstacles are, shape (2, worlds * obstacles) [m].
+        pairs: Places of pairs of agents of a world, each both ways, in ascending order.
+        beside: Places of pairs of an agent and an obstacle of its world, in ascending order.
     """
 
     points: FloatArray
-    agents: Offsets
-    obstacles: Offsets
+    centres: FloatArray
+    pairs: tuple[IntArray, IntArray]
+    beside: tuple[IntArray, IntArray]
+
+    @cached_property
+    def agents(self) -> Offsets:
+        """How the agents of the pairs lie to each other."""
+        flat = self.points.reshape(2, -1)
+        return Offsets.between(self.pairs, flat, flat)
+
+    @cached_property
+    def obstacles(self) -> Offsets:
+        """How the obstacles lie to the agents."""
+        return Offsets.between(self.beside, self.points.reshape(2, -1), self.centres)
 
 
 class Nearby:
@@ -103,12 +118,7 @@ class Nearby:
         obstacles = max(self._sensing + self._largest, self._touch + reach)
         if (self._cells or self._resting) and not self._holds(points, (agents, obstacles)):
             self._find(points, agents, obstacles)
-        flat = points.reshape(2, -1)
-        return Near(
-            points,
-            Offsets.between(self._of_agents, flat, flat),
-            Offsets.between(self._of_obstacles, flat, self._obstacles),
-        )
+        return Near(points, self._obstacles, self._of_agents, self._of_obstacles)
 
     def _holds(self, points: FloatArray, up_to: tuple[float, float]) -> bool:
         """Tell whether the pairs of before hold all that is no further apart than that [m]."""

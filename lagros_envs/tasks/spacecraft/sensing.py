@@ -6,13 +6,15 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from lagros_envs.arrays import Float32Array, FloatArray, IntArray
+from lagros_envs.arrays import Float32Array
+from lagros_envs.tasks.spacecraft.loops import sensed_into
 from lagros_envs.tasks.spacecraft.scenarios import Preset
+from lagros_envs.tasks.spacecraft.slots import Slots
 from lagros_envs.tasks.spacecraft.task import STATE_DIM, SpacecraftSettings
 from lagros_envs.tasks.spacecraft.world import SpacecraftWorld
 
@@ -130,6 +132,13 @@ def observe(world: SpacecraftWorld, layout: Layout) -> Float32Array:
     # A caller who ignores `truncated` goes past the limit.
     own[..., 8] = np.minimum(world.time, layout.time_limit)[:, None]
     near, radius = world.near, world.settings.sensing_radius
+    others = Slots.between(at["neighbours"], at["neighbour_mask"], agents - 1)
+    discs = Slots.between(at["obstacles"], at["obstacle_mask"], world.obstacles)
+    if world.compiled:
+        if sensed_into(rows, world.parts, radius, world.obstacle_radii, near, others, discs):
+            return rows.reshape(worlds, agents, -1)
+        # Somebody senses more than there are slots for.
+        rows[:, others.begin :] = 0.0
     if agents > 1:
         pairs = near.agents
         seen = np.flatnonzero(pairs.square <= radius**2)
@@ -140,8 +149,7 @@ def observe(world: SpacecraftWorld, layout: Layout) -> Float32Array:
             values[:, column] = speed.take(whom) - speed.take(whose)
         number = np.arange(worlds * agents) % agents
         which = number.take(whom) - (whom > whose)
-        slots = _Slots(at["neighbours"], at["neighbour_mask"], agents - 1)
-        slots.fill(rows, whose, which, values, pairs.square.take(seen))
+        others.fill(rows, whose, which, values, pairs.square.take(seen))
     if world.obstacles:
         pairs, radii = near.obstacles, world.obstacle_radii.reshape(-1)
         # -inf where there is no obstacle: its square must not count.
@@ -149,68 +157,11 @@ def observe(world: SpacecraftWorld, layout: Layout) -> Float32Array:
         seen = np.flatnonzero(pairs.square <= (reach * np.abs(reach)).take(pairs.other))
         whose, disc = pairs.one.take(seen), pairs.other.take(seen)
         size = radii.take(disc)
-        discs = np.empty((len(seen), OBSTACLE_DIM), np.float32)
-        discs[:, 0], discs[:, 1], discs[:, 2] = pairs.x.take(seen), pairs.y.take(seen), size
-        slots = _Slots(at["obstacles"], at["obstacle_mask"], world.obstacles)
+        values = np.empty((len(seen), OBSTACLE_DIM), np.float32)
+        values[:, 0], values[:, 1], values[:, 2] = pairs.x.take(seen), pairs.y.take(seen), size
         rims = np.sqrt(pairs.square.take(seen)) - size
-        slots.fill(rows, whose, disc % world.obstacles, discs, rims)
+        discs.fill(rows, whose, disc % world.obstacles, values, rims)
     return rows.reshape(worlds, agents, -1)
-
-
-class _Slots(NamedTuple):
-    """The slots of one kind in an observation, and their mask.
-
-    Attributes:
-        slots: Where the slots are.
-        mask: Where their mask is, as long as there are slots.
-        most: How many bodies of that kind one agent might sense in a world.
-    """
-
-    slots: slice
-    mask: slice
-    most: int
-
-    def fill(
-        self,
-        rows: Float32Array,
-        whose: IntArray,
-        which: IntArray,
-        values: Float32Array,
-        distances: FloatArray,
-    ) -> None:
-        """Write what is sensed.
-
-        Each body has the slot of its number where there are as many slots. Else those that are
-        sensed lie side by side in the order of their numbers, and should more be sensed than there
-        are slots, which bodies that keep clear of each other cannot do, the nearest.
-
-        Args:
-            rows: The observations, shape (rows, size), in which nothing is sensed yet.
-            whose: The row that senses, ascending, shape (p,).
-            which: The number of what it senses among those of its world, likewise for each row.
-            values: What is to be seen of it, shape (p, numbers).
-            distances: In whose order they are nearest, shape (p,).
-        """
-        count, size = rows.shape
-        room = self.mask.stop - self.mask.start
-        if room < self.most:
-            which = _places_among(whose, count)
-            if which.max(initial=0) >= room:
-                order = np.lexsort((distances, whose))
-                order = np.sort(order[_places_among(whose[order], count) < room])
-                whose, values = whose[order], values[order]
-                which = _places_among(whose, count)
-        flat, begin, dim = rows.reshape(-1), whose * size, values.shape[1]
-        flat[begin + (self.mask.start + which)] = 1.0
-        begin += self.slots.start + dim * which
-        flat[begin[:, None] + np.arange(dim)] = values
-
-
-def _places_among(whose: IntArray, rows: int) -> IntArray:
-    """Return of ascending rows (p,) how many of the same came before."""
-    counts = np.bincount(whose, minlength=rows)
-    begins: IntArray = np.cumsum(counts) - counts
-    return np.arange(len(whose)) - begins[whose]
 
 
 def named_state_space(agents: int, obstacles: int, time_limit: float) -> spaces.Dict:

@@ -12,6 +12,7 @@ from lagros_envs.disturbances import Disturbance, Situation
 from lagros_envs.dynamics.held import HeldBatch
 from lagros_envs.sweep import Path, swept_agents, swept_obstacles
 from lagros_envs.tasks.spacecraft import task
+from lagros_envs.tasks.spacecraft.loops import touched
 from lagros_envs.tasks.spacecraft.nearby import Near, Nearby
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
 
@@ -185,12 +186,7 @@ class SpacecraftWorld:
         self.forces = control
         self.effort += effort
         self.step_count = self.step_count + 1
-        near = self._look(float(path.reach.max()))
-        hit = swept_agents(path, 2.0 * self.agent_radius, near.agents)
-        if self.obstacles:
-            contact = self.obstacle_radii + self.core_radius[:, None]
-            hit |= swept_obstacles(path, self.obstacle_centres, contact, near.obstacles)
-        hit |= ~integrated
+        hit = self._touched(path, self._look(float(path.reach.max()))) | ~integrated
         first_collision = hit & ~self.collided
         # The end of the step at the latest.
         self.collision_time = np.where(first_collision, self.time[:, None], self.collision_time)
@@ -298,6 +294,16 @@ class SpacecraftWorld:
             )
         self._near = self._nearby.at(self.parts[:2].copy(), reach)
         return self._near
+
+    def _touched(self, path: Path, near: Near) -> BoolArray:
+        """Return who came too close to an agent or an obstacle on the way."""
+        contact, touch = 2.0 * self.agent_radius, self.obstacle_radii + self.core_radius[:, None]
+        if self.compiled:
+            return touched(path, contact, self.obstacle_centres, touch, near)
+        hit = swept_agents(path, contact, near.agents)
+        if self.obstacles:
+            hit |= swept_obstacles(path, self.obstacle_centres, touch, near.obstacles)
+        return hit
 
     def _current_push(self) -> FloatArray:
         """Return d of this step, (6, worlds, agents)."""
