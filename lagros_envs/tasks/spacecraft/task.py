@@ -192,7 +192,8 @@ def applied_forces(settings: SpacecraftSettings, actions: Any) -> FloatArray:
     with np.errstate(over="ignore"):
         forces = settings.thrust_scale * np.asarray(actions, dtype=np.float64)
     limit = settings.thrust_limit
-    return np.clip(forces, 0.0, LARGEST_FORCE if limit is None else limit)
+    # `np.clip` takes twice as long for a few agents.
+    return np.minimum(np.maximum(forces, 0.0), LARGEST_FORCE if limit is None else limit)
 
 
 def nominal_from_options(

@@ -108,7 +108,7 @@ class SpacecraftWorld:
     @property
     def states(self) -> FloatArray:
         """The states x, shape (worlds, agents, 6)."""
-        return np.array(np.moveaxis(self.parts, 0, -1), order="C")
+        return self.parts.transpose(1, 2, 0).copy()
 
     @property
     def time(self) -> FloatArray:
@@ -179,7 +179,7 @@ class SpacecraftWorld:
         """
         settings = self.settings
         before = self.goal_distance
-        control = np.array(np.moveaxis(forces, -1, 0), order="C")
+        control = forces.transpose(2, 0, 1).copy()
         self.push = self._current_push()
         path, integrated = self._advance(control)
         effort = np.einsum("uwa,uwa->wa", control, control) * settings.control_period
@@ -205,7 +205,7 @@ class SpacecraftWorld:
     def near(self) -> Near:
         """What may be sensed: who is near whom, and near which obstacle."""
         near = self._near
-        if near is None or not np.array_equal(near.points, self.parts[:2]):
+        if near is None or not (near.points == self.parts[:2]).all():
             near = self._look(0.0)
         return near
 
@@ -229,7 +229,7 @@ class SpacecraftWorld:
             "collision_time": self.collision_time.copy(),
             "effort": self.effort.copy(),
             "effort_to_success": self.effort_to_success.copy(),
-            "disturbance": np.array(np.moveaxis(self.push, 0, -1), order="C"),
+            "disturbance": self.push.transpose(1, 2, 0).copy(),
             "tube_radius": np.repeat(radius[:, None], self.agents, axis=1),
             "goal_distance": distance,
         }
@@ -311,16 +311,16 @@ class SpacecraftWorld:
             return self.push
         # Past the time limit (a caller who ignored `truncated`) the last push stays.
         index = np.minimum(self.step_count, self.settings.steps - 1)
-        push = np.moveaxis(self._pushes[self._everywhere, index], 1, 0)
+        push = self._pushes[self._everywhere, index].transpose(1, 0, 2)
         if not self.disturbance.is_feedback:
-            return np.array(push, order="C")
+            return push.copy()
         situation = Situation(
             self.states,
             self.nominal_now(),
             np.repeat(self.time[:, None], self.agents, axis=1),
-            np.moveaxis(push, 0, -1),
+            push.transpose(1, 2, 0),
         )
-        return np.array(np.moveaxis(self.disturbance.respond(situation), -1, 0), order="C")
+        return self.disturbance.respond(situation).transpose(2, 0, 1).copy()
 
     def _advance(self, control: FloatArray) -> tuple[Path, BoolArray]:
         """Move the states over one control step, and tell which could be integrated."""

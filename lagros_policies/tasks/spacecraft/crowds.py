@@ -43,11 +43,12 @@ from lagros_policies.tasks.spacecraft.thrusters import allocate
 
 @dataclass(frozen=True)
 class CrowdSettings:
-    """What to fly at one pace.
+    """What to fly at one least pace.
 
     Attributes:
         flights: The worlds; no expert plans there.
         pace: As of `Receding` [m/s].
+        fastest: Likewise.
         guide: What labels, and flies first.
 
     Raises:
@@ -56,15 +57,16 @@ class CrowdSettings:
 
     flights: FlightSettings
     pace: float = 0.4
+    fastest: float = 0.7
     guide: Guide = field(default_factory=Guide)
 
     def __post_init__(self) -> None:
-        check_fields(self, positive=("pace",))
+        check_fields(self, positive=("pace", "fastest"))
 
     @property
     def receding(self) -> Receding:
         """What the agents are shown."""
-        return Receding(pace=self.pace)
+        return Receding(pace=self.pace, fastest=self.fastest)
 
 
 class _Guided(SpacecraftNetworkPolicy):
@@ -86,7 +88,9 @@ class _Guided(SpacecraftNetworkPolicy):
         features = self.features(sensed)
         own = self.network(features).astype(np.float64)
         radii = self.preset.agent_radius, self.preset.core
-        plane = self.guide.acceleration(sensed, self.receding.pace, *radii)
+        way, left = np.hypot(*sensed.goal.T), self.settings.horizon - sensed.time
+        pace = self.receding.pace_of(way, left)
+        plane = self.guide.acceleration(sensed, pace, *radii)
         self.sensed = sensed
         self.label = np.stack([plane.real, plane.imag, own[:, 2]], axis=-1)
         if not self.flies:

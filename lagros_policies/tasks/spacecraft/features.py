@@ -62,14 +62,15 @@ def own_features(
         left: Until the horizon [s].
         receding: How far goals are shown; None for all the way.
     """
+    pace = None
     if receding is not None:
-        goal = receding.shown(goal)
+        pace, goal = receding.pace_of(abs(goal), left), receding.shown(goal)
     # A shift that no observation, in single precision, can undo: nothing is divided by zero.
     shifted = goal + SMALL
     distance = abs(shifted)
     frame = shifted / distance
     course = velocity * frame.conj()
-    time = time_to_go(distance, left) if receding is None else receding.time_to_go(distance)
+    time = time_to_go(distance, left) if receding is None else receding.time_to_go(distance, pace)
     near, soon = minimum(distance, CLOSE), minimum(time, SOON)
     over = distance / (time + SOON)
     return (distance, near, course.real, course.imag, time, soon, over, turn, spin), frame

@@ -59,14 +59,14 @@ class Guide:
         check_fields(self, positive=positive, not_negative=margins)
 
     def acceleration(
-        self, sensed: Sensed, pace: float, agent_radius: float, core_radius: float
+        self, sensed: Sensed, pace: FloatArray, agent_radius: float, core_radius: float
     ) -> ComplexArray:
         """Return what the agents should do, complex, shape (B,) [m/s^2].
 
         Args:
             sensed: What they sense.
-            pace: As of `Receding`; the speed far from the goal is 1.5 times that, as a plan's from
-                rest to rest is [m/s].
+            pace: As of `Receding`, shape (B,); the speed far from the goal is 1.5 times that, as a
+                plan's from rest to rest is [m/s].
             agent_radius: Radius of every agent against the others [m].
             core_radius: Radius against obstacles [m].
         """
@@ -99,7 +99,7 @@ class Guide:
         answer: ComplexArray = self.gain * (allowed - velocity)
         return answer
 
-    def _wished(self, goal: ComplexArray, pace: float) -> ComplexArray:
+    def _wished(self, goal: ComplexArray, pace: FloatArray) -> ComplexArray:
         """Return the velocity to the goal that can still be braked, (B,) [m/s]."""
         distance = np.abs(goal)
         # Straight through the goal up to twice that distance, from where on it is the root.

@@ -1,8 +1,10 @@
 """Receding goals: what an agent is shown of a goal far away, and its way out of a deadlock.
 
 A network that has learned ways of a few metres within half a minute can fly any way: it is shown
-the point `reach` ahead on the straight line to the goal, always with the same time for it. That is
-a function of what is sensed, so that NumPy, C and ONNX compute it alike.
+the point `reach` ahead on the straight line to the goal, and a time for it. The pace, one over the
+other, is that at which the whole way takes a `share` of the time left until T, between a least and
+a greatest one: who has time keeps out of others' way. That is a function of what is sensed, so that
+NumPy, C and ONNX compute it alike.
 
 Agents that wait for each other wait for ever: all see the same at every step. The rule against it
 needs no word between them and three numbers of each:
@@ -32,10 +34,11 @@ from lagros_policies.tasks.spacecraft.pace import LEAST_TIME
 LEARNED_AGENTS, LEARNED_ARENA = 8, 6.0  # [m]
 # Of a plan from rest to rest, the largest over the mean.
 SPEED_OF_PACE = 1.5
-# Usual paces [m/s]: the first, or that at which the longest ways, of 1.28 times the side of the
-# arena, take three quarters of T, up to the second.
-SLOWEST, FASTEST = 0.4, 0.7
-LONGEST_WAY, SHARE_OF_TIME = 1.28, 0.75
+# Paces [m/s]: none is less than the first, or than that at which the longest ways, of 1.28 times
+# the side of the arena, take this share of T; none is more than the second.
+SLOWEST, FASTEST = 0.25, 0.7
+LONGEST_WAY, SHARE_OF_TIME = 1.28, 0.85
+_SOON = 1e-3  # what counts as time left when there is none [s]
 # How often detours become wider, and how often longer.
 _WIDER, _LONGER = 2, 3
 COUNTERS = ("detours", "detour_steps")
@@ -73,7 +76,9 @@ class Receding:
 
     Attributes:
         reach: Farther goals are shown this far ahead [m].
-        pace: Distance of what is shown over the time that is shown for it [m/s].
+        pace: Least distance of what is shown over the time that is shown for it [m/s].
+        fastest: The greatest [m/s].
+        share: Of the time left, in which the whole way is to be flown.
         progress: How much closer counts as progress [m].
         patience: Time without progress before a detour [s].
         angle: By which the point ahead is turned about the agent first [rad].
@@ -86,6 +91,8 @@ class Receding:
 
     reach: float = 2.0
     pace: float = SLOWEST
+    fastest: float = FASTEST
+    share: float = 0.5
     progress: float = 0.1
     patience: float = 3.0
     angle: float = 1.5
@@ -95,6 +102,7 @@ class Receding:
     def __post_init__(self) -> None:
         positive = [item.name for item in fields(self) if item.name != "wider"]
         check_fields(self, positive=positive, not_negative=("wider",))
+        check_at_most("pace", self.pace, self.fastest)
         check_at_most("angle", self.angle + _WIDER * self.wider, float(np.pi))
 
     @classmethod
@@ -108,7 +116,7 @@ class Receding:
                 receding goals where worlds are larger than those in which the networks learned.
             preset: Of the worlds, with their number of agents.
             horizon: T, for which the usual pace is chosen [s].
-            speed_limit: Largest speed [m/s], which is 1.5 times a pace; None for no limit.
+            speed_limit: Largest speed [m/s], which is 1.5 times the pace; None for no limit.
 
         Raises:
             ValueError: It is something else, a field is unknown, or a value is out of range.
@@ -116,8 +124,8 @@ class Receding:
         if given is None:
             given = preset.agents > LEARNED_AGENTS or preset.arena > LEARNED_ARENA
         fastest = FASTEST if speed_limit is None else min(FASTEST, speed_limit / SPEED_OF_PACE)
-        asked = min(LONGEST_WAY * preset.arena / (SHARE_OF_TIME * horizon), fastest)
-        usual = cls(pace=max(asked, SLOWEST))
+        asked = max(LONGEST_WAY * preset.arena / (SHARE_OF_TIME * horizon), SLOWEST)
+        usual = cls(pace=min(asked, fastest), fastest=fastest)
         if isinstance(given, bool):
             return usual if given else None
         return built_like(usual, given, "receding")
@@ -127,9 +135,19 @@ class Receding:
         distance = abs(goal)
         return goal * minimum(self.reach / maximum(distance, self.reach), 1.0)
 
-    def time_to_go(self, distance: Any) -> Any:
-        """Return the time that is shown for the distance of that point [s]."""
-        return maximum(distance * (1.0 / self.pace), LEAST_TIME)
+    def pace_of(self, distance: Any, left: Any) -> Any:
+        """Return the pace at which a way of that distance [m] is flown [m/s].
+
+        Args:
+            distance: Of the goal itself, of any kind of number [m].
+            left: Until T; zero or less when that has passed [s].
+        """
+        asked = distance / maximum(left * self.share, _SOON)
+        return minimum(maximum(asked, self.pace), self.fastest)
+
+    def time_to_go(self, distance: Any, pace: Any) -> Any:
+        """Return the time that is shown for the distance of the point that is shown [s]."""
+        return maximum(distance / pace, LEAST_TIME)
 
     def turned(
         self, goal: ComplexArray, memory: Waiting, arrived: float, period: float

@@ -43,6 +43,7 @@ from lagros_policies.tasks.spacecraft.flights import (
     flight_samples,
     fly_expert,
 )
+from lagros_policies.tasks.spacecraft.guide import Guide
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.setup import CROWDED, PUBLISHED, spacecraft_range
 from lagros_policies.tasks.spacecraft.station import StationSettings, fly_station
@@ -64,15 +65,26 @@ def _rounds() -> tuple[FlightSettings, ...]:
 
 
 def _crowds() -> tuple[tuple[CrowdSettings, ...], ...]:
-    scenes = (
-        ("swarm-45", 0.3, (12, 32)),
-        ("swarm-45", 0.4, (12, 32)),
-        ("swarm-45", 0.5, (12, 32)),
-        ("gcbf", 0.4, (10,)),
-        ("gcbf", 0.5, (10,)),
+    few, many = (12, 32), (10,)
+    even = tuple(
+        (preset, pace, pace, agents, Guide())
+        for preset, pace, agents in (
+            ("swarm-45", 0.3, few),
+            ("swarm-45", 0.4, few),
+            ("swarm-45", 0.5, few),
+            ("gcbf", 0.4, many),
+            ("gcbf", 0.5, many),
+        )
+    )
+    # Who is in a hurry keeps less room; who has time flies no faster than it must.
+    hurried = Guide(pair_margin=0.12, obstacle_margin=0.08, look=1.5)
+    paced = (
+        ("swarm", 0.25, 0.7, few, Guide()),
+        ("swarm-45", 0.6, 0.7, few, hurried),
+        ("gcbf", 0.25, 0.33, many, Guide()),
     )
     # Worlds of each scene, and seeds, by round.
-    rounds = (12, range(41, 46)), (8, range(51, 56))
+    rounds = (even, 12, range(41, 46)), (even, 8, range(51, 56)), (paced, 12, range(61, 64))
     return tuple(
         tuple(
             CrowdSettings(
@@ -85,10 +97,12 @@ def _crowds() -> tuple[tuple[CrowdSettings, ...], ...]:
                     seed=seed,
                 ),
                 pace,
+                fastest,
+                guide,
             )
-            for (preset, pace, agents), seed in zip(scenes, seeds, strict=True)
+            for (preset, pace, fastest, agents, guide), seed in zip(scenes, seeds, strict=True)
         )
-        for worlds, seeds in rounds
+        for scenes, worlds, seeds in rounds
     )
 
 
