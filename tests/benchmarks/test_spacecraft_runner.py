@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from lagros_benchmarks.run.library import SetupError
 from lagros_benchmarks.run.runner import Case, fly_scene, run_benchmark
 from lagros_benchmarks.run.settings import BenchmarkSettings, Condition
 from lagros_benchmarks.tasks.spacecraft.experiment import SpacecraftExperiment
+from lagros_benchmarks.tasks.spacecraft.guaranteed import kept_apart
 from lagros_benchmarks.tasks.spacecraft.timing import time_policy
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from tests.benchmarks import spacecraft_fakes as fakes
@@ -227,3 +229,12 @@ def test_the_filter_with_a_proof_flies_by_name():
     assert not any(agent.collided for world in run.episodes[case] for agent in world.agents)
     (row,) = summarise(run)
     assert row["proved_filter"]
+    assert (row["guaranteed_rate"], row["guaranteed_arriving_rate"]) == (1.0, 0.0)
+    assert row["guarantees_contradicted"] == 0
+
+
+def test_nothing_is_proved_of_worlds_that_begin_outside_of_what_the_filter_keeps():
+    counts = np.array([[5, 1, 0], [5, 0, 0], [5, 0, 0], [5, 2, 1]])
+    env = types.SimpleNamespace(num_worlds=2)
+    loop = types.SimpleNamespace(memory=types.SimpleNamespace(counts=counts), env=env)
+    assert [one["guaranteed"] for one in kept_apart(loop)] == [True, False]

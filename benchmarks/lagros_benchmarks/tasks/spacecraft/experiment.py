@@ -18,6 +18,7 @@ from lagros_benchmarks.run.workers import Progress
 from lagros_benchmarks.tasks.spacecraft.claims import position_margin, tracked_with_a_gain
 from lagros_benchmarks.tasks.spacecraft.episodes import (
     Flight,
+    Prover,
     Trace,
     WorldRecord,
     WorldsLoop,
@@ -26,7 +27,7 @@ from lagros_benchmarks.tasks.spacecraft.episodes import (
     make_filter,
     make_worlds,
 )
-from lagros_benchmarks.tasks.spacecraft.guaranteed import proved
+from lagros_benchmarks.tasks.spacecraft.guaranteed import kept_apart, proved
 from lagros_benchmarks.tasks.spacecraft.timing import PLAN_WORLDS, Timing, time_plans, time_policy
 from lagros_envs.arrays import FloatArray
 from lagros_envs.tasks.spacecraft.scenarios import Scenario
@@ -150,9 +151,15 @@ class SpacecraftExperiment:
         def worlds(count: int) -> SpacecraftVectorEnv:
             return self.environment(case, count)
 
-        bound = case.condition.bound
-        prove = partial(proved, policy=policy, bound=bound) if tracked_with_a_gain(policy) else None
-        return fly_chunk(worlds, policy, units, margin, prove)
+        return fly_chunk(worlds, policy, units, margin, self._prover(case, policy))
+
+    def _prover(self, case: Case, policy: BasePolicy) -> Prover | None:
+        """Return what says of worlds what is proved of them; None where nothing is."""
+        if case.safety_filter and self.settings.safety_filter == PROVED_FILTER:
+            return kept_apart
+        if tracked_with_a_gain(policy):
+            return partial(proved, policy=policy, bound=case.condition.bound)
+        return None
 
     def time(self, case: Case, units: Sequence[int]) -> list[Timing]:
         """Measure the times of the calls, and of more plans than those worlds need."""

@@ -18,6 +18,7 @@ from lagros_envs.arrays import BoolArray, FloatArray
 from lagros_envs.tasks.spacecraft.vector import SpacecraftVectorEnv
 from lagros_policies.contraction.statement import Statement, at_most
 from lagros_policies.policy import BasePolicy, PolicyState, make
+from lagros_policies.tasks.spacecraft.filtering import COUNTERS
 from lagros_policies.tasks.spacecraft.guarantee import WorldGuarantee, guarantee
 
 # Worlds that fly in one batch, instants from one aim to the next, and kinds that fly beside.
@@ -252,6 +253,16 @@ def proved(loop: WorldsLoop, policy: Any, bound: float) -> list[dict[str, Any]]:
             }
         )
     return said
+
+
+def kept_apart(loop: WorldsLoop) -> list[dict[str, Any]]:
+    """Return what is proved of worlds that have flown with the proved filter; see `proved`.
+
+    It is about whoever begins in the set that the filter keeps, and of nobody else.
+    """
+    outside = loop.memory.counts[:, COUNTERS.index("infeasible")]
+    inside = ~outside.reshape(loop.env.num_worlds, -1).any(axis=1)
+    return [{"guaranteed": bool(one), "arriving": False} for one in inside]
 
 
 def _proved(
