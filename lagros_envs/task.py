@@ -150,6 +150,10 @@ class Described:
         """The Gymnasium id."""
         return f"lagros/{self.title}-v0"
 
+    def agents_of(self, preset: str | None) -> tuple[int, ...]:
+        """Return how many agents the worlds of a preset have where nobody says how many."""
+        return self.defaults.agents
+
 
 @dataclass(frozen=True)
 class Task(Described):

@@ -444,16 +444,20 @@ def test_it_learns_to_reach_goals(tmp_path):
 # The actor
 
 
-def test_the_shipped_actor_flies_as_its_record_says():
+@pytest.mark.parametrize(("preset", "agents"), [("paper", 6), ("gcbf", 8)])
+def test_the_shipped_actor_flies_as_its_record_says(preset, agents):
     """The file and the record are of one run: on the record's own episodes, its own figures."""
-    record = json.loads((PRETRAINED / "spacecraft_ppo.json").read_text())
+    name = "spacecraft_ppo" if preset == "paper" else f"spacecraft_ppo_{preset}"
+    record = json.loads((PRETRAINED / f"{name}.json").read_text())
     run = default_training("spacecraft", "ppo")
+    if preset != "paper":
+        run = replace(run.in_worlds(preset, None), segments=20)
     assert record["training"] == json.loads(json.dumps(run.record()))
     seeds = episode_seeds(0, run.final_episodes, FINAL)
     row = record["final"][0]
-    assert (row["preset"], row["agents"], row["worlds"]) == ("paper", 6, len(seeds))
-    policy = SpacecraftPpoPolicy(preset="paper", num_agents=6)
-    flown = training.evaluate(policy, "paper", 6, seeds, row["disturbance"], row["bound"])
+    assert (row["preset"], row["agents"], row["worlds"]) == (preset, agents, len(seeds))
+    policy = SpacecraftPpoPolicy(preset=preset, num_agents=agents)
+    flown = training.evaluate(policy, preset, agents, seeds, row["disturbance"], row["bound"])
     for name, value in training.summary(flown).items():
         # Another processor may round differently, and a flight then end otherwise.
         assert value == pytest.approx(row[name], rel=0.01, abs=0.003)

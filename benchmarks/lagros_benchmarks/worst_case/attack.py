@@ -107,6 +107,8 @@ class AttackSettings:
             "episodes": usual.attack_episodes,
             "goal": goal,
         }
+        # Of one body there are none.
+        defaults |= dict(zip(("agents",), described.agents_of(given.get("preset")), strict=False))
         return cls(task=described.name, search=search, **(defaults | chosen))
 
     def episode_seeds(self) -> list[int]:

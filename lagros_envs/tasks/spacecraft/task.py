@@ -122,6 +122,10 @@ class SpacecraftSettings(Described):
         for name in ("horizon", "time_limit"):
             check_multiple(name, getattr(self, name), "control_period", self.control_period, 1e-6)
 
+    def agents_of(self, preset: str | None) -> tuple[int, ...]:
+        """Return how many agents the worlds of a preset have where nobody says how many."""
+        return (PRESETS[preset].agents,) if preset in PRESETS else super().agents_of(preset)
+
     @property
     def steps(self) -> int:
         """Control steps of an episode that runs to its limit."""

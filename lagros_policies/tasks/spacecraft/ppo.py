@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lagros_envs.arrays import BoolArray, ComplexArray, Float32Array, FloatArray
 from lagros_envs.tasks.spacecraft import task
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS
 from lagros_envs.tasks.spacecraft.sensing import Layout
 from lagros_policies.learning.networks import Mlp
 from lagros_policies.policy import PolicyState
@@ -152,7 +153,8 @@ def thrust_of(
 class SpacecraftPpoPolicy(SpacecraftActor):
     """The trained actor, its mean action, for any number of agents.
 
-    `lagros train spacecraft --algo ppo` trains it, with six agents in the preset `paper`.
+    `lagros train spacecraft --algo ppo` trains it, with six agents in the preset `paper`; another
+    has learned the task of `gcbf`, with eight.
     """
 
     name = recorded_as = "ppo"
@@ -162,6 +164,10 @@ class SpacecraftPpoPolicy(SpacecraftActor):
     trained_in = ("paper",)  # the features count on the radii of its bodies
     weights_file = "spacecraft_ppo.safetensors"
     network: Mlp
+
+    def _shipped(self) -> str:
+        anchor = dict(self.preset.task) == dict(PRESETS["gcbf"].task)
+        return "spacecraft_ppo_gcbf.safetensors" if anchor else self.weights_file
 
     def predict(
         self,
