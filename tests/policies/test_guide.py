@@ -98,12 +98,19 @@ def test_head_on_both_lean_to_their_right_and_an_obstacle_is_left_to_one():
     assert blocked.real < met.real
 
 
+def test_crowds_whose_t_differs_are_flown_apart():
+    many = replace(SMALL, preset="swarm", agents=(12, 32))
+    with pytest.raises(ValueError, match=r"agents=\(12, 32\).*swarm.*one by one"):
+        CrowdSettings(many)
+    assert CrowdSettings(replace(many, preset="swarm-45")).flights.agents == (12, 32)
+
+
 SMALL = FlightSettings(worlds=4, worlds_per_shard=2, agents=(3,), sample_every=20, seed=9)
 
 
 @pytest.fixture(scope="module", params=["swarm-45", "gcbf"])
 def crowd(request, tmp_path_factory):
-    settings = CrowdSettings(replace(SMALL, preset=request.param))
+    settings = CrowdSettings(replace(SMALL, preset=request.param), fastest=0.4)
     folder = tmp_path_factory.mktemp(request.param)
     return settings, folder, fly_crowd(folder / "guided", settings, SHIPPED, True)
 

@@ -106,12 +106,24 @@ def test_the_goal_shown_is_at_most_the_reach_ahead(kind):
         goal = kind(cmath.rect(length, rng.uniform(-math.pi, math.pi)))
         shown = receding.shown(goal)
         assert abs(shown) == pytest.approx(min(length, 1.5), abs=1e-12)
-        assert receding.time_to_go(abs(shown)) == pytest.approx(max(4.0 * abs(shown), 2.0))
+        assert receding.time_to_go(abs(shown), 0.25) == pytest.approx(max(4.0 * abs(shown), 2.0))
         if length:
             assert cmath.phase(shown) == pytest.approx(cmath.phase(goal))
     together = rng.normal(size=20) + 1j * rng.normal(size=20)
     alone = [receding.shown(complex(goal)) for goal in together]
     np.testing.assert_allclose(receding.shown(together), alone)
+
+
+def test_a_pace_is_that_at_which_the_way_takes_its_share_of_the_time_left():
+    receding = Receding(pace=0.3, fastest=0.6, share=0.5)
+    for way, left, pace in (
+        *((4.0, 20.0, 0.4), (2.0, 20.0, 0.3), (9.0, 20.0, 0.6), (9.0, 60.0, 0.3)),
+        *((1.0, 0.0, 0.6), (1.0, -10.0, 0.6), (0.0, 10.0, 0.3), (0.0, -10.0, 0.3)),
+    ):
+        assert receding.pace_of(way, left) == pytest.approx(pace)
+        np.testing.assert_allclose(receding.pace_of(np.array([way]), np.array([left])), pace)
+    with pytest.raises(ValueError, match=r"pace=0\.8.*at most"):
+        Receding(pace=0.8)
 
 
 def one_agent(receding, distances, arrived):

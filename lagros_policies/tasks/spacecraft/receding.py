@@ -35,9 +35,9 @@ LEARNED_AGENTS, LEARNED_ARENA = 8, 6.0  # [m]
 # Of a plan from rest to rest, the largest over the mean.
 SPEED_OF_PACE = 1.5
 # Paces [m/s]: none is less than the first, or than that at which the longest ways, of 1.28 times
-# the side of the arena, take this share of T; none is more than the second.
+# the side of the arena, take T; none is more than the second.
 SLOWEST, FASTEST = 0.25, 0.7
-LONGEST_WAY, SHARE_OF_TIME = 1.28, 0.85
+LONGEST_WAY = 1.28
 _SOON = 1e-3  # what counts as time left when there is none [s]
 # How often detours become wider, and how often longer.
 _WIDER, _LONGER = 2, 3
@@ -124,7 +124,7 @@ class Receding:
         if given is None:
             given = preset.agents > LEARNED_AGENTS or preset.arena > LEARNED_ARENA
         fastest = FASTEST if speed_limit is None else min(FASTEST, speed_limit / SPEED_OF_PACE)
-        asked = max(LONGEST_WAY * preset.arena / (SHARE_OF_TIME * horizon), SLOWEST)
+        asked = max(LONGEST_WAY * preset.arena / horizon, SLOWEST)
         usual = cls(pace=min(asked, fastest), fastest=fastest)
         if isinstance(given, bool):
             return usual if given else None

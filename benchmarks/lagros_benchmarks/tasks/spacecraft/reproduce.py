@@ -79,8 +79,8 @@ def _crowds() -> tuple[tuple[CrowdSettings, ...], ...]:
     # Who is in a hurry keeps less room; who has time flies no faster than it must.
     hurried = Guide(pair_margin=0.12, obstacle_margin=0.08, look=1.5)
     paced = (
-        ("swarm", 0.25, 0.7, few, Guide()),
-        ("swarm-45", 0.6, 0.7, few, hurried),
+        ("swarm", 0.25, 0.7, (32,), Guide(pair_margin=0.24, obstacle_margin=0.17)),
+        ("swarm-45", 0.5, 0.7, few, hurried),
         ("gcbf", 0.25, 0.33, many, Guide()),
     )
     # Worlds of each scene, and seeds, by round.
