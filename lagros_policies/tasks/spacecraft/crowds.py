@@ -65,8 +65,8 @@ class CrowdSettings:
         preset, agents = preset_named(self.flights.preset), self.flights.agents
         if len({settings_for(preset.for_agents(count)).horizon for count in agents}) > 1:
             raise ValueError(
-                f"agents={agents}: the T of {self.flights.preset} grows with their number, and what "
-                "is shown of a goal depends on it; fly them one by one"
+                f"agents={agents}: the T of {self.flights.preset} grows with their number, and "
+                "what is shown of a goal depends on it; fly them one by one"
             )
 
     @property
