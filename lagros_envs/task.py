@@ -134,8 +134,7 @@ class Described:
         room: Its folder under `tasks/` of the packages above; None where it needs none.
         defaults: Of the commands.
         most_agents: Agents that a world may have; 1 for a task of one body.
-        presets: Kinds of worlds; of one body, forms of other sizes, this one first and each other
-            registered as NAME-PRESET (`registry.in_preset`); () for none.
+        presets: Kinds of worlds; of one body its forms, this one first, others NAME-PRESET.
     """
 
     name: str
@@ -151,7 +150,7 @@ class Described:
         return f"lagros/{self.title}-v0"
 
     def agents_of(self, preset: str | None) -> tuple[int, ...]:
-        """Return how many agents the worlds of a preset have where nobody says how many."""
+        """Return how many agents the worlds of a preset have if nobody says how many."""
         return self.defaults.agents
 
 
@@ -390,8 +389,7 @@ class Task(Described):
 
         Returns:
             -w_e ||u - centre||^2 dt - w_d distance dt + b_a dt [not down] + b_s [first success].
-            The distance counts as at most b_a / w_d, so that a step more never costs more than
-            ending the episode.
+            The distance counts as at most b_a / w_d: no step costs more than ending the episode.
         """
         reach = self.alive_bonus - self.distance_weight * distance
         stay = self.control_period * (0.5 * (reach + abs(reach)))

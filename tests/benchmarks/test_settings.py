@@ -6,8 +6,10 @@ import pytest
 
 import lagros_policies
 from lagros_benchmarks.run.settings import BenchmarkSettings, check_policy
+from lagros_benchmarks.worst_case.attack import AttackSettings
 from lagros_envs.registry import task_named, task_names
 from lagros_envs.seeding import EVALUATION, episode_seeds
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS
 from lagros_policies.tasks.spacecraft import SPACECRAFT_NAMES
 
 
@@ -59,6 +61,17 @@ SINGLE = [name for name in task_names() if task_named(name).most_agents == 1]
 def test_one_body_has_no_settings_of_many_agents(task, changes):
     with pytest.raises(ValueError, match=f"does not fit: {task} is one body; leave it out"):
         BenchmarkSettings.for_task(task, **changes)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_preset_has_its_own_number_of_agents(preset):
+    own = PRESETS[preset].agents
+    bench = BenchmarkSettings.for_task("spacecraft", preset=preset)
+    assert (bench.preset, bench.agents) == (preset, (own,))
+    attack = AttackSettings.for_task("spacecraft", "hybrid", None, preset=preset)
+    assert (attack.preset, attack.agents) == (preset, own)
+    assert BenchmarkSettings.for_task("spacecraft", preset=preset, agents=(3,)).agents == (3,)
+    assert AttackSettings.for_task("spacecraft", "hybrid", 99, preset=preset, agents=2).agents == 2
 
 
 def test_each_task_has_its_own_defaults():

@@ -75,6 +75,44 @@ class CrowdSettings:
         return Receding(pace=self.pace, fastest=self.fastest)
 
 
+def usual_rounds() -> tuple[tuple[CrowdSettings, ...], ...]:
+    """Return the scenes of each round from which the network that ships is made."""
+    few, many, usual = (12, 32), (10,), Guide()
+    even = tuple(
+        (preset, pace, pace, agents, usual)
+        for preset, agents, paces in (
+            ("swarm-45", few, (0.3, 0.4, 0.5)),
+            ("gcbf", many, (0.4, 0.5)),
+        )
+        for pace in paces
+    )
+    # Who has time keeps more room, and who is in a hurry less.
+    paced = (
+        ("swarm", 0.25, 0.7, (32,), Guide(pair_margin=0.24, obstacle_margin=0.17)),
+        ("swarm-45", 0.5, 0.7, few, Guide(pair_margin=0.12, obstacle_margin=0.08, look=1.5)),
+        ("gcbf", 0.25, 0.33, many, usual),
+    )
+    # Worlds of each scene, and seeds, by round.
+    rounds = (even, 12, range(41, 46)), (even, 8, range(51, 56)), (paced, 12, range(61, 64))
+    return tuple(
+        tuple(
+            CrowdSettings(
+                FlightSettings(
+                    worlds=worlds,
+                    worlds_per_shard=4,
+                    agents=agents,
+                    preset=preset,
+                    sample_every=5,
+                    seed=seed,
+                ),
+                *(pace, fastest, guide),
+            )
+            for (preset, pace, fastest, agents, guide), seed in zip(scenes, seeds, strict=True)
+        )
+        for scenes, worlds, seeds in rounds
+    )
+
+
 class _Guided(SpacecraftNetworkPolicy):
     """The policy of a crowd, which can fly the guide; it keeps what it saw and what it should do.
 

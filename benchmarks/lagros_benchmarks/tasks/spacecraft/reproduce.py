@@ -35,7 +35,7 @@ from lagros_policies.learning.train_deep_set import (
     join,
     only,
 )
-from lagros_policies.tasks.spacecraft.crowds import CrowdSettings, fly_crowd
+from lagros_policies.tasks.spacecraft.crowds import CrowdSettings, fly_crowd, usual_rounds
 from lagros_policies.tasks.spacecraft.expert import SpacecraftExpertSettings
 from lagros_policies.tasks.spacecraft.flights import (
     FlightData,
@@ -43,7 +43,6 @@ from lagros_policies.tasks.spacecraft.flights import (
     flight_samples,
     fly_expert,
 )
-from lagros_policies.tasks.spacecraft.guide import Guide
 from lagros_policies.tasks.spacecraft.sensed import Sensed
 from lagros_policies.tasks.spacecraft.setup import CROWDED, PUBLISHED, spacecraft_range
 from lagros_policies.tasks.spacecraft.station import StationSettings, fly_station
@@ -62,48 +61,6 @@ def _rounds() -> tuple[FlightSettings, ...]:
     # One round: in later ones agents come to rest, and labels that would move them left or right
     # add up to nothing (docs/results-spacecraft.md).
     return (FlightSettings(worlds=800, replan_period=4.0, expert=stiff, seed=11),)
-
-
-def _crowds() -> tuple[tuple[CrowdSettings, ...], ...]:
-    few, many = (12, 32), (10,)
-    even = tuple(
-        (preset, pace, pace, agents, Guide())
-        for preset, pace, agents in (
-            ("swarm-45", 0.3, few),
-            ("swarm-45", 0.4, few),
-            ("swarm-45", 0.5, few),
-            ("gcbf", 0.4, many),
-            ("gcbf", 0.5, many),
-        )
-    )
-    # Who is in a hurry keeps less room; who has time flies no faster than it must.
-    hurried = Guide(pair_margin=0.12, obstacle_margin=0.08, look=1.5)
-    paced = (
-        ("swarm", 0.25, 0.7, (32,), Guide(pair_margin=0.24, obstacle_margin=0.17)),
-        ("swarm-45", 0.5, 0.7, few, hurried),
-        ("gcbf", 0.25, 0.33, many, Guide()),
-    )
-    # Worlds of each scene, and seeds, by round.
-    rounds = (even, 12, range(41, 46)), (even, 8, range(51, 56)), (paced, 12, range(61, 64))
-    return tuple(
-        tuple(
-            CrowdSettings(
-                FlightSettings(
-                    worlds=worlds,
-                    worlds_per_shard=4,
-                    agents=agents,
-                    preset=preset,
-                    sample_every=5,
-                    seed=seed,
-                ),
-                pace,
-                fastest,
-                guide,
-            )
-            for (preset, pace, fastest, agents, guide), seed in zip(scenes, seeds, strict=True)
-        )
-        for scenes, worlds, seeds in rounds
-    )
 
 
 @dataclass(frozen=True)
@@ -147,7 +104,7 @@ class SpacecraftReproduceSettings:
     )
     rounds: tuple[FlightSettings, ...] = field(default_factory=_rounds)
     station: StationSettings = field(default_factory=StationSettings)
-    crowds: tuple[tuple[CrowdSettings, ...], ...] = field(default_factory=_crowds)
+    crowds: tuple[tuple[CrowdSettings, ...], ...] = field(default_factory=usual_rounds)
     kept: StationSettings = field(
         default_factory=lambda: StationSettings(
             flights=FlightSettings(worlds=150, sample_every=9, seed=31)
