@@ -59,16 +59,18 @@ class Cell(NamedTuple):
         agents: N.
         bound: d_bar.
         filtered: Whether the safety filter flies along.
+        crowds: Whether the network of crowds flies where it is not the usual one.
     """
 
     preset: str
     agents: int
     bound: float
     filtered: bool
+    crowds: bool = False
 
 
 CELLS = tuple(
-    Cell(preset, agents, bound, filtered)
+    Cell(preset, agents, bound, filtered, crowds)
     for preset, numbers, bound, filtered in (
         ("swarm", (32, 128, 512, 1024), 0.4, True),
         ("swarm", (32, 128), 0.4, False),
@@ -76,11 +78,16 @@ CELLS = tuple(
         ("gcbf", (8, 32, 128, 512, 1024), 0.4, True),
         ("gcbf", (8, 32, 128, 512, 1024), 1.0, True),
         ("gcbf", (8,), 0.4, False),
-        ("gcbf-free", (8, 32, 128), 0.4, True),
-        ("paper", (6,), 0.4, True),
+        ("gcbf-free", (8, 32, 128, 512, 1024), 0.4, True),
+        *(("paper", (6,), bound, True) for bound in (0.2, 0.4, 1.0)),
+        *(("paper", (6,), bound, False) for bound in (0.2, 0.4, 1.0)),
     )
     for agents in numbers
+    for crowds in ((False, True) if preset == "paper" else (False,))
 )
+
+
+_PAPER = Cell("paper", 6, 0.4, True)  # what is drawn of that preset
 
 
 def worlds_of(cell: Cell) -> int:
@@ -122,7 +129,8 @@ def _batch(
         compiled=False,
         autoreset_mode="disabled",
     )
-    policy: Any = SpacecraftLagrosPolicy(env.settings, env.preset)
+    receding = True if cell.crowds else None
+    policy: Any = SpacecraftLagrosPolicy(env.settings, env.preset, receding=receding)
     if cell.filtered:
         policy = SafetyFilter(policy, env.settings, env.preset, disturbance_bound=cell.bound)
     observation, info = env.reset(seed=seeds)
@@ -135,6 +143,10 @@ def _batch(
     names = ("success", "collided", "reached", "effort_to_success")
     ends = env.settings.horizon, env.settings.time_limit
     return {name: info[name] for name in names}, policy.counters(state), times, *ends
+
+
+def _cell_of(row: dict[str, Any]) -> Cell:
+    return Cell(*(row[name] for name in Cell._fields))
 
 
 def show(rows: list[dict[str, Any]]) -> None:
@@ -150,7 +162,7 @@ def show(rows: list[dict[str, Any]]) -> None:
         rates = (row["safe_rate"], row["reached_rate"], row["safe_reached_rate"])
         detours = row["counters"].get("detours")
         table.add_row(
-            row["preset"],
+            row["preset"] + (" (crowds)" if row["crowds"] else ""),
             str(row["agents"]),
             f"{row['bound']:g}",
             "yes" if row["filtered"] else "no",
@@ -169,6 +181,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 3, figsize=(10.0, 3.4), layout="constrained")
+    rows = [row for row in rows if row["preset"] != "paper" or _cell_of(row) == _PAPER]
     for kind in dict.fromkeys((row["preset"], row["bound"], row["filtered"]) for row in rows):
         preset, bound, filtered = kind
         line = [row for row in rows if (row["preset"], row["bound"], row["filtered"]) == kind]
@@ -213,7 +226,7 @@ def main() -> None:
     numbers = None if options.agents is None else list(map(int, options.agents.split(",")))
     kept = options.json is not None and options.json.exists()
     rows = json.loads(options.json.read_text())["rows"] if kept else []
-    done = {Cell(*(row[name] for name in Cell._fields)) for row in rows}
+    done = {_cell_of(row) for row in rows}
     for cell in CELLS:
         wanted = (presets is None or cell.preset in presets) and (
             numbers is None or cell.agents in numbers
@@ -221,7 +234,7 @@ def main() -> None:
         if not wanted or cell in done:
             continue
         rows.append(fly(cell))
-        rows.sort(key=lambda row: CELLS.index(Cell(*(row[name] for name in Cell._fields))))
+        rows.sort(key=lambda row: CELLS.index(_cell_of(row)))
         if options.json is not None:
             command = f"python benchmarks/studies/swarms.py --json {options.json}"
             text = json.dumps({"command": command, "seed": SEED, "rows": rows}, indent=1)

@@ -49,6 +49,7 @@ class CrowdSettings:
         flights: The worlds; no expert plans there.
         pace: As of `Receding` [m/s].
         fastest: Likewise.
+        share: Likewise.
         guide: What labels, and flies first.
 
     Raises:
@@ -58,10 +59,11 @@ class CrowdSettings:
     flights: FlightSettings
     pace: float = 0.4
     fastest: float = 0.7
+    share: float = 0.5
     guide: Guide = field(default_factory=Guide)
 
     def __post_init__(self) -> None:
-        check_fields(self, positive=("pace", "fastest"))
+        check_fields(self, positive=("pace", "fastest", "share"))
         preset, agents = preset_named(self.flights.preset), self.flights.agents
         if len({settings_for(preset.for_agents(count)).horizon for count in agents}) > 1:
             raise ValueError(
@@ -72,7 +74,7 @@ class CrowdSettings:
     @property
     def receding(self) -> Receding:
         """What the agents are shown."""
-        return Receding(pace=self.pace, fastest=self.fastest)
+        return Receding(pace=self.pace, fastest=self.fastest, share=self.share)
 
 
 def usual_rounds() -> tuple[tuple[CrowdSettings, ...], ...]:
@@ -87,13 +89,15 @@ def usual_rounds() -> tuple[tuple[CrowdSettings, ...], ...]:
         for pace in paces
     )
     # Who has time keeps more room, and who is in a hurry less.
+    patient = Guide(pair_margin=0.24, obstacle_margin=0.17)
+    hurried = Guide(pair_margin=0.1, obstacle_margin=0.06, look=1.5)
     paced = (
-        ("swarm", 0.25, 0.7, (32,), Guide(pair_margin=0.24, obstacle_margin=0.17)),
-        ("swarm-45", 0.5, 0.7, few, Guide(pair_margin=0.12, obstacle_margin=0.08, look=1.5)),
+        ("swarm", 0.25, 0.7, (32,), patient),
+        ("swarm-45", 0.5, 0.7, few, hurried),
         ("gcbf", 0.25, 0.33, many, usual),
     )
-    # Worlds of each scene, and seeds, by round.
-    rounds = (even, 12, range(41, 46)), (even, 8, range(51, 56)), (paced, 12, range(61, 64))
+    # The scenes, the worlds of each, and their first seed, by round.
+    rounds = (even, (12,) * 5, 41), (even, (8,) * 5, 51), (paced, (24, 24, 12), 61)
     return tuple(
         tuple(
             CrowdSettings(
@@ -105,11 +109,15 @@ def usual_rounds() -> tuple[tuple[CrowdSettings, ...], ...]:
                     sample_every=5,
                     seed=seed,
                 ),
-                *(pace, fastest, guide),
+                pace,
+                fastest,
+                guide=guide,
             )
-            for (preset, pace, fastest, agents, guide), seed in zip(scenes, seeds, strict=True)
+            for (preset, pace, fastest, agents, guide), worlds, seed in zip(
+                scenes, counts, range(first, first + len(scenes)), strict=True
+            )
         )
-        for scenes, worlds, seeds in rounds
+        for scenes, counts, first in rounds
     )
 
 

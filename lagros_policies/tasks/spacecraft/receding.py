@@ -92,7 +92,7 @@ class Receding:
     reach: float = 2.0
     pace: float = SLOWEST
     fastest: float = FASTEST
-    share: float = 0.5
+    share: float = 0.4
     progress: float = 0.1
     patience: float = 3.0
     angle: float = 1.5
