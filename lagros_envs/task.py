@@ -149,9 +149,9 @@ class Described:
         """The Gymnasium id."""
         return f"lagros/{self.title}-v0"
 
-    def agents_of(self, preset: str | None) -> tuple[int, ...]:
-        """Return how many agents the worlds of a preset have if nobody says how many."""
-        return self.defaults.agents
+    def defaults_in(self, preset: str | None) -> Defaults:
+        """Return what the commands take in the worlds of a preset; None for the usual one."""
+        return self.defaults
 
 
 @dataclass(frozen=True)

@@ -152,8 +152,9 @@ def check_trained_for(
         needed = _needed(range_of(metadata, what, assumed), name, value)
         if needed is not None:
             raise ValueError(
-                f"{name}={value!r}: {what} was made for {needed}; use what was made for this task, "
-                "or give lagros_policies.make allow_other_settings=True to fly outside of that"
+                f"{name}={value!r}: {what} was made for {needed}; use a policy that was "
+                "made for this task, or give lagros_policies.make allow_other_settings=True to "
+                "fly outside of that"
             )
 
 

@@ -7,6 +7,7 @@ import pytest
 import lagros_policies
 from lagros_benchmarks.run.settings import BenchmarkSettings, check_policy
 from lagros_benchmarks.worst_case.attack import AttackSettings
+from lagros_envs import spacecraft_v0
 from lagros_envs.registry import task_named, task_names
 from lagros_envs.seeding import EVALUATION, episode_seeds
 from lagros_envs.tasks.spacecraft.scenarios import PRESETS
@@ -72,6 +73,13 @@ def test_a_preset_has_its_own_number_of_agents(preset):
     assert (attack.preset, attack.agents) == (preset, own)
     assert BenchmarkSettings.for_task("spacecraft", preset=preset, agents=(3,)).agents == (3,)
     assert AttackSettings.for_task("spacecraft", "hybrid", 99, preset=preset, agents=2).agents == 2
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_what_flies_where_nobody_is_named_is_made_for_the_preset(preset):
+    env = spacecraft_v0.parallel_env(preset=preset)
+    for policy in BenchmarkSettings.for_task("spacecraft", preset=preset).policies:
+        assert lagros_policies.make(policy, env).settings == env.settings
 
 
 def test_each_task_has_its_own_defaults():

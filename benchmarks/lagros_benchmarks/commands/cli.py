@@ -207,7 +207,7 @@ def bench(
             refuse_options(["--bound"], "no disturbance has a bound")
         planned = [
             name
-            for name in named or described.defaults.policies
+            for name in named or described.defaults_in(preset).policies
             if name.partition(":")[0] == "tube-mpc"
         ]
         if replan_every is not None:

@@ -259,14 +259,12 @@ class BenchmarkSettings:
         Raises:
             ValueError: A setting is not valid.
         """
-        described = find_any(task)
-        usual = described.defaults
+        usual = find_any(task).defaults_in(given.get("preset"))
         chosen = {name: value for name, value in given.items() if value is not None}
         # A comparison of numbers of agents has no use for a sweep over bounds.
         bounds = (usual.bound,) if len(chosen.get("agents", ())) > 1 else usual.bounds
-        names = ("policies", "episodes", "preset", "safety_filter")
+        names = ("policies", "episodes", "agents", "preset", "safety_filter")
         defaults = {name: getattr(usual, name) for name in names} | {"bounds": bounds}
-        defaults["agents"] = described.agents_of(given.get("preset"))
         return cls(task=task, **(defaults | chosen))
 
     @property

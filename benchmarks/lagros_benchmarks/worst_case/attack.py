@@ -93,7 +93,7 @@ class AttackSettings:
         """
         described = find_any(task)
         check_fits(described, agents=given.get("agents"), preset=given.get("preset"))
-        usual = described.defaults
+        usual = described.defaults_in(given.get("preset"))
         bench = bench_of(described.name)
         search = SearchSettings(
             method,
@@ -108,7 +108,7 @@ class AttackSettings:
             "goal": goal,
         }
         # Of one body there are none.
-        defaults |= dict(zip(("agents",), described.agents_of(given.get("preset")), strict=False))
+        defaults |= dict(zip(("agents",), usual.agents, strict=False))
         return cls(task=described.name, search=search, **(defaults | chosen))
 
     def episode_seeds(self) -> list[int]:

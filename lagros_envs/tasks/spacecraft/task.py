@@ -122,9 +122,15 @@ class SpacecraftSettings(Described):
         for name in ("horizon", "time_limit"):
             check_multiple(name, getattr(self, name), "control_period", self.control_period, 1e-6)
 
-    def agents_of(self, preset: str | None) -> tuple[int, ...]:
-        """Return how many agents the worlds of a preset have where nobody says how many."""
-        return (PRESETS[preset].agents,) if preset in PRESETS else super().agents_of(preset)
+    def defaults_in(self, preset: str | None) -> Defaults:
+        """Return what the commands take in the worlds of a preset; None for the usual one."""
+        usual = self.defaults
+        if preset not in PRESETS:
+            return usual
+        own = PRESETS[preset]
+        # (a) has learned no other limits; PPO has.
+        learned = "ppo" if own.task else usual.policies[0]
+        return replace(usual, agents=(own.agents,), policies=(learned, *usual.policies[1:]))
 
     @property
     def steps(self) -> int:
