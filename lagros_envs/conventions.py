@@ -57,8 +57,8 @@ class Conforming:
         """Control steps after which an episode is truncated."""
         return self.settings.steps
 
-    def _usual_steps(self) -> int:
-        """Return the limit that the id is registered with."""
+    def _usual_steps(self) -> int | None:
+        """Return the limit that the id is registered with; None for none."""
         return type(self.settings)().steps
 
     def __copy__(self) -> Self:
@@ -84,7 +84,7 @@ class Conforming:
         self._spec = value
 
 
-def check_step_limit(limit: int | None, settings: LimitedSettings, usual: int) -> None:
+def check_step_limit(limit: int | None, settings: LimitedSettings, usual: int | None) -> None:
     """Check Gymnasium's `max_episode_steps` against the task's own time limit.
 
     An id is registered with the limit of the default settings, which so stands for none being
@@ -93,7 +93,7 @@ def check_step_limit(limit: int | None, settings: LimitedSettings, usual: int) -
     Args:
         limit: Control steps; None for no limit.
         settings: The task.
-        usual: The limit that the id is registered with.
+        usual: The limit that the id is registered with; None for none.
 
     Raises:
         ValueError: The limit is not a positive number, is longer than the task's, or is that of
@@ -108,7 +108,7 @@ def check_step_limit(limit: int | None, settings: LimitedSettings, usual: int) -
             f"settings.time_limit={settings.time_limit:g}: a longer episode is another task, with "
             f"settings of time_limit={limit * settings.control_period:g}"
         )
-    if limit == usual < settings.steps:
+    if limit == usual and limit < settings.steps:
         raise ValueError(
             f"settings.time_limit={settings.time_limit:g} is {settings.steps} control steps, and "
             f"Gymnasium ends the episodes of this id after max_episode_steps={limit} unless told "

@@ -9,14 +9,15 @@ class Shipped(NamedTuple):
     Attributes:
         task: What gives the task with its default settings.
         title: As in `gym.make("lagros/TITLE-v0")`.
-        steps: Control steps of an episode of the default settings.
+        steps: Control steps of an episode of the default settings, after which Gymnasium ends it;
+            None where its worlds have limits of their own, which they keep by themselves.
         env: Its environment.
         vector: Its vector form.
     """
 
     task: str
     title: str
-    steps: int
+    steps: int | None
     env: str = "lagros_envs.env:TaskEnv"
     vector: str = "lagros_envs.vector:TaskVectorEnv"
 
@@ -32,7 +33,7 @@ SHIPPED = {
     "spacecraft": Shipped(
         "lagros_envs.tasks.spacecraft.task:SpacecraftSettings",
         "Spacecraft",
-        450,
+        None,
         "lagros_envs.tasks.spacecraft.single:SpacecraftEnv",
         "lagros_envs.tasks.spacecraft.vector:SpacecraftVectorEnv",
     ),

@@ -12,8 +12,8 @@ from gymnasium.wrappers import RescaleObservation, TimeAwareObservation
 
 from lagros_envs import conventions
 from lagros_envs.tasks.cartpole.task import CartPoleSettings
-from lagros_envs.tasks.spacecraft.scenarios import PRESETS
-from lagros_envs.tasks.spacecraft.task import SpacecraftSettings
+from lagros_envs.tasks.spacecraft.scenarios import PRESETS, preset_named
+from lagros_envs.tasks.spacecraft.task import SpacecraftSettings, settings_for
 from tests.envs.subjects import CARTPOLE, EVERY, IDS, PETTINGZOO, SHORT, SINGLE, SPACECRAFT, VECTOR
 
 # What is asked before a step is the same in every mode of autoreset.
@@ -371,7 +371,6 @@ def test_success_has_the_name_that_other_libraries_read(name):
 @pytest.mark.parametrize("name", IDS)
 def test_ids_are_registered_with_the_steps_of_their_task(name):
     steps = DEFAULTS[name].steps
-    assert gym.spec(name).max_episode_steps == steps
     assert gym.make(name).spec.max_episode_steps == steps
     assert gym.make(name, max_episode_steps=-1).spec.max_episode_steps == steps
     assert gym.make_vec(name, num_envs=2).spec.max_episode_steps == steps
@@ -419,12 +418,32 @@ def test_a_shorter_task_ends_at_its_own_limit(name):
     assert gym.make_vec(name, 2, settings=settings).spec.max_episode_steps == 10
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_is_made_by_its_name_and_lasts_as_long_as_it_says(preset):
+    env = gym.make(SPACECRAFT, preset=preset)
+    steps = settings_for(preset_named(preset).for_agents(1)).steps
+    assert env.spec.max_episode_steps == env.unwrapped.settings.steps == steps
+    assert gym.make(env.spec).spec.max_episode_steps == steps
+    for count in {1, PRESETS[preset].agents}:
+        worlds = gym.make_vec(SPACECRAFT, 2 * count, preset=preset, num_agents=count)
+        longest = settings_for(preset_named(preset).for_agents(count)).steps
+        assert worlds.spec.max_episode_steps == worlds.unwrapped.settings.steps == longest
+        sooner = gym.make_vec(
+            SPACECRAFT, count, preset=preset, num_agents=count, max_episode_steps=9
+        )
+        assert ends(sooner, SPACECRAFT, 9) == [9]
+    assert ends(gym.make(SPACECRAFT, preset=preset, max_episode_steps=9), SPACECRAFT, 9) == [9]
+
+
 @pytest.mark.parametrize("name", IDS)
 def test_a_longer_task_is_never_cut_in_silence(name):
     settings = {"time_limit": 60.0}
     for make in (gym.make, gym.make_vec):
-        with pytest.raises(ValueError, match="pass max_episode_steps=600, too"):
-            make(name, settings=settings)
+        if name == SPACECRAFT:
+            assert make(name, settings=settings).spec.max_episode_steps == 600
+        else:
+            with pytest.raises(ValueError, match="pass max_episode_steps=600, too"):
+                make(name, settings=settings)
         env = make(name, settings=settings, max_episode_steps=600)
         assert env.spec.max_episode_steps == env.unwrapped.step_limit == 600
         again = make(env.spec)

@@ -27,8 +27,8 @@ class SpacecraftEnv(OneWorld, gym.Env[Float32Array, Float32Array]):
 
     The world, action, observation, reward and info of `SpacecraftParallelEnv` with a
     single agent: the one slot for a neighbour is always empty. `terminated` at a collision,
-    `truncated` at 45 s; the episode goes on after the arrival. `max_episode_steps` of `gym.make` is
-    as in `CartPoleEnv`.
+    `truncated` at the time limit of the preset, 45 s of `paper`; the episode goes on after the
+    arrival. `gym.make(..., max_episode_steps=20)` ends it sooner.
 
     `reset(options=...)` takes `scenario`, a `tasks.spacecraft.scenarios.Scenario` of one agent,
     and `nominal`, x_d at every control instant, shape (steps + 1, 6).
@@ -117,6 +117,9 @@ class SpacecraftEnv(OneWorld, gym.Env[Float32Array, Float32Array]):
         """The state x in double precision, shape (6,)."""
         self.episode.need_start("state")
         return cast(FloatArray, self.episode.world.states[0, 0])
+
+    def _usual_steps(self) -> None:
+        """Return none: every preset has its own limit, which the environment keeps by itself."""
 
     def _observation(self) -> Float32Array:
         return cast(Float32Array, observe(self.episode.world, self.episode.layout)[0, 0])

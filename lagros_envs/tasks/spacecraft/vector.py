@@ -158,6 +158,9 @@ class SpacecraftVectorEnv(RestartingVectorEnv):
         check_started(self._started, "scenarios")
         return list(self.world.scenarios)
 
+    def _usual_steps(self) -> None:
+        """Return none: every preset has its own limit, which the environment keeps by itself."""
+
     def _checked(self, mask: BoolArray, options: dict[str, Any]) -> dict[str, Any]:
         nominal = task.nominal_from_options(
             options, self.settings, (self.num_worlds, self.num_agents), mask
