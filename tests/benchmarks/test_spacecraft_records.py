@@ -275,6 +275,9 @@ def test_what_is_proved_of_worlds_is_counted_and_held_against_the_flights():
     crash = dataclasses.replace(proved(4, 0.1), agents=(agent(False, max_position_error=0.1),))
     wrong = (proved(5, 0.3), crash)
     assert records._guarantees(wrong)["guarantees_contradicted"] == 2
+    # The proved filter bounds no error to a plan that flies behind it.
+    only = records._guarantees((proved(6, 0.1, arriving=False, position_error_bound=None),))
+    assert (only["guaranteed_rate"], only["bound_over_worst"]) == (1.0, None)
     # No statement is about a policy that tracks no plan.
     assert set(records._guarantees(OURS).values()) == {None}
 

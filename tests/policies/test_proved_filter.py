@@ -264,7 +264,10 @@ def test_starts_are_covered_up_to_a_bound_and_no_farther():
     found = reserved_for(TASK, PAPER, BOUND)
     assert found.reserve.clearance <= PAPER.margin
     # A thrust limit leaves less for the answer to d.
-    limited = [largest_bound(dataclasses.replace(TASK, thrust_limit=one), PAPER) for one in (1, 4)]
+    limited = [
+        largest_bound(dataclasses.replace(TASK, thrust_limit=one), PAPER, ReserveSettings())
+        for one in (1, 4)
+    ]
     assert 0.0 < limited[0] < limited[1] < most
 
 
@@ -317,6 +320,26 @@ def test_what_is_not_proved_is_refused(settings, bound, reserve):
     env = worlds(PAIR, "none", 1)
     with pytest.raises(ValueError, match="use a smaller"):
         ProvedFilter(Rush(env), settings, PAIR, disturbance_bound=bound, reserve=reserve)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_is_proved_at_the_bound_of_its_results(name):
+    preset = PRESETS[name].for_agents(1024)
+    found = reserved_for(settings_for(preset), preset, BOUND)
+    assert found.holds
+    assert found.covers_starts
+
+
+def test_what_thrust_is_left_makes_a_body_as_fast_as_the_proof_lets_it():
+    preset = PRESETS["gcbf"]
+    task = settings_for(preset)
+    chosen = [reserved_for(task, preset, bound) for bound in (0.1, 0.2, 0.3, 0.4)]
+    speeds = [one.speed for one in chosen]
+    assert speeds == sorted(speeds, reverse=True)
+    # No slower than what the usual stop allows, where that holds.
+    usual = reserved_for(task, preset, 0.2, ReserveSettings())
+    assert usual.holds
+    assert chosen[1].speed >= usual.speed
 
 
 def test_settings_are_checked():

@@ -32,7 +32,7 @@ from lagros_policies.tasks.spacecraft.held_turn import turned as turned_by
 from lagros_policies.tasks.spacecraft.world_tube import thrust_rounding
 
 # Lags of the sums over the past.
-_LAGS = 1000
+_LAGS = 200
 # Relative: twice what single precision rounds, as a difference has two; more than double precision.
 _SINGLE, _DOUBLE = 2.0**-23, 1e-13
 # What rounding does to headings beyond what their size makes of it [rad].
@@ -41,11 +41,13 @@ _TURNED = 1e-6
 _SOLVED = 1e-5
 _ROUNDS, _RAISE, _HOPELESS = 60, 1.0 + 1e-4, 1e3
 # Double poles of F + g K that are tried.
-_POLES = tuple(0.1 * step for step in range(1, 9))
+_POLES = tuple(0.05 * step for step in range(2, 17))
 # sin(theta) stays below this.
 _NARROW = 0.9
 # Of a thrust limit, what the torque may take, and of the rest the nominal motion.
-_TURNING, _STRAIGHT = 0.25, 0.4
+_TURNING, _STRAIGHT = 0.2, 0.4
+# What is tried beside that where thrust is limited: less for the nominal motion, longer stops [s].
+_LESS, _LONGER = (0.4, 0.3, 0.2, 0.1, 0.05), (0.5, 0.3, 0.15)
 
 
 @dataclass(frozen=True)
@@ -234,7 +236,8 @@ def reserved_for(
         task: The task.
         preset: The radii, and the margin of the starts.
         disturbance_bound: d_bar, in units of the state per second.
-        settings: What the filter may do; the defaults if left out.
+        settings: What the filter may do; the defaults if left out, or, where thrust is limited,
+            what lets a body be fastest among what holds and covers the starts.
 
     Returns:
         The constants with the least room about a body among those that hold; if none do, what is
@@ -246,16 +249,24 @@ def reserved_for(
     """
     check_spacecraft(task.system, "reserved_for")
     check_disturbance_bound("disturbance_bound", disturbance_bound)
-    chosen = _within_thrust(task, ReserveSettings() if settings is None else settings)
-    poles = _POLES if chosen.pole is None else (chosen.pole,)
-    tried = [_reserved(task, preset, disturbance_bound, chosen, pole) for pole in poles]
-    found = [one for one in tried if one is not None]
-    if not found:
+
+    def merit(one: Reserved) -> tuple[bool, bool, float]:
+        return not one.holds, not one.covers_starts, one.reserve.clearance + one.reserve.error
+
+    best: Reserved | None = None
+    for chosen in _tries(task, disturbance_bound, settings):
+        poles = _POLES if chosen.pole is None else (chosen.pole,)
+        tried = [_reserved(task, preset, disturbance_bound, chosen, pole) for pole in poles]
+        found = [one for one in tried if one is not None]
+        best = min([*found, *([] if best is None else [best])], key=merit, default=None)
+        if best is not None and best.holds and best.covers_starts:
+            break
+    if best is None:
         raise ValueError(
             f"disturbance_bound={disturbance_bound!r} is more than the filter can stand: no bound "
             "of its error was found; use a smaller one"
         )
-    return min(found, key=lambda one: (not one.holds, one.reserve.clearance + one.reserve.error))
+    return best
 
 
 def largest_bound(
@@ -280,15 +291,35 @@ def _torque_share(task: SpacecraftSettings) -> float:
     return max(arm, side) / (2.0 * (arm**2 + side**2))
 
 
-def _within_thrust(task: SpacecraftSettings, settings: ReserveSettings) -> ReserveSettings:
-    """Return the settings with no more turning and acceleration than a thrust limit leaves."""
+def _tries(
+    task: SpacecraftSettings, bound: float, settings: ReserveSettings | None
+) -> list[ReserveSettings]:
+    """Return what the filter may do, the fastest first."""
+    if settings is not None or task.thrust_limit is None:
+        return [_within_thrust(task, settings or ReserveSettings(), bound)]
+    tries = [
+        _within_thrust(task, ReserveSettings(stopping_time), bound, straight)
+        for straight in _LESS
+        for stopping_time in _LONGER
+    ]
+    h = task.control_period
+    return sorted(tries, key=lambda one: -one.acceleration * (one.stopping_time + 0.5 * h))
+
+
+def _within_thrust(
+    task: SpacecraftSettings, settings: ReserveSettings, bound: float, straight: float = _STRAIGHT
+) -> ReserveSettings:
+    """Return the settings with no more turning and acceleration than a thrust limit leaves.
+
+    A torque that answers d is left in any case.
+    """
     if task.thrust_limit is None:
         return settings
     turning = _TURNING * task.thrust_limit / (_torque_share(task) * 2.0 * task.system.inertia)
-    straight = _STRAIGHT * 2.0 * (1.0 - _TURNING) * task.thrust_limit / task.system.mass
+    straight *= 2.0 * (1.0 - _TURNING) * task.thrust_limit / task.system.mass
     return replace(
         settings,
-        spin_rate=min(settings.spin_rate, turning),
+        spin_rate=min(settings.spin_rate, max(turning, bound)),
         acceleration=min(settings.acceleration, straight),
     )
 

@@ -186,8 +186,8 @@ def _guarantees(worlds: Sequence[WorldRecord]) -> Row:
         "guarantees_contradicted": sum(map(_contradicts, worlds)),
     }
     worst = max((_worst(world) for world in kept), default=0.0)
-    if worst > 0.0:
-        bounds = [world.position_error_bound or np.inf for world in kept]
+    bounds = [one.position_error_bound for one in kept if one.position_error_bound is not None]
+    if worst > 0.0 and len(bounds) == len(kept):
         row["bound_over_worst"] = float(max(bounds) / worst)
     return row
 
