@@ -299,6 +299,19 @@ def test_thrusters_push_and_keep_their_limit(limit):
         assert infeasible.sum() > 10
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("bound", [0.0, 0.4, 1.0, 3.0])
+def test_limited_thrust_keeps_more_room_to_obstacles_and_leaves_it_to_starts(preset, bound):
+    usual = BarrierSettings.for_bound(bound)
+    kept = filter_of(np.zeros((1, 8)), preset, None, disturbance_bound=bound).barrier.settings
+    limited = "thrust_limit" in dict(PRESETS[preset].task)
+    assert kept.pair_margin == usual.pair_margin
+    assert (kept.obstacle_margin > usual.obstacle_margin) == (limited and bound < 2.5)
+    assert kept.obstacle_margin in (usual.obstacle_margin, kept.pair_margin, 0.375)
+    given = filter_of(np.zeros((1, 8)), preset, None, barrier=usual).barrier.settings
+    assert given.obstacle_margin == usual.obstacle_margin
+
+
 def test_within_its_limit_the_filter_violates_least():
     rng = np.random.default_rng(19)
     settings = SpacecraftSettings(thrust_limit=0.4)

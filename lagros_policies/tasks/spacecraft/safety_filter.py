@@ -41,7 +41,8 @@ class SafetyFilter(ActionFilter):
     Args:
         policy: The inner policy, of the spacecraft; its actions are those of the environment.
         settings: The task. With a thrust limit the filter commands no thruster beyond it, and a
-            torque that leaves no room for the force gives way.
+            torque that leaves no room for the force gives way; the margin to obstacles is then that
+            between agents, as far as starts and goals leave room for it, unless one is given.
         preset: The preset, or its name: the layout of the observation and the radii.
         num_agents: Number of agents; None for the preset's own.
         disturbance_bound: d_bar to prepare for, in units of the state per second.
@@ -69,6 +70,10 @@ class SafetyFilter(ActionFilter):
             # Two thrusters push along an axis; half of that is kept for the rest.
             most = limit / self.settings.system.mass
             chosen = replace(chosen, braking=min(chosen.braking, most))
+            if barrier is None:
+                # It takes longer to come back from a push; starts and goals must stay outside.
+                room = min(chosen.pair_margin, 0.5 * self.preset.aside)
+                chosen = replace(chosen, obstacle_margin=max(chosen.obstacle_margin, room))
         self.barrier = BrakingBarrier(
             chosen,
             self.preset.agent_radius,
