@@ -63,6 +63,7 @@ SMALL = {
     "python benchmarks/speed/spacecraft_world.py": ("--sizes", "1x8", "--rounds", "1"),
     "python benchmarks/studies/plan_law.py": ("--episodes", "1"),
     "python benchmarks/studies/swarms.py": ("--cells", "gcbf-free", "--agents", "8"),
+    "python benchmarks/studies/swarms_proved.py": ("--cells", "gcbf-free", "--agents", "8"),
     "python benchmarks/studies/plan_tubes.py": (
         "--tasks",
         "car",
