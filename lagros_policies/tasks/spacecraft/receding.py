@@ -102,7 +102,7 @@ class Receding:
     def __post_init__(self) -> None:
         positive = [item.name for item in fields(self) if item.name != "wider"]
         check_fields(self, positive=positive, not_negative=("wider",))
-        check_at_most("pace", self.pace, self.fastest)
+        check_at_most("pace", self.pace, self.fastest, "or fastest must be larger")
         check_at_most("angle", self.angle + _WIDER * self.wider, float(np.pi))
 
     @classmethod
